@@ -1,0 +1,185 @@
+"""Every size in one place: frozen dataclasses, and the presets toy, S, M, L and XL.
+
+A configuration is plain data. It holds no tensor and knows no module, so a checkpoint can carry it as JSON
+(`Preset.to_dict`) and a reader can compare two models by comparing two dictionaries.
+"""
+
+from dataclasses import asdict, dataclass, field, fields
+
+
+@dataclass(frozen=True)
+class VAEConfig:
+    """MAC-VAE: `down` halvings of time, so one latent stands for `2**down` frames (CMDM Sec. 4.1, A.1)."""
+
+    input_dim: int = 263
+    latent_dim: int = 64
+    width: int = 1024
+    down: int = 2  # two stride-2 convolutions: 4 frames per latent
+    depth: int = 3  # blocks per residual stack, with dilations growth**(depth-1), ..., growth, 1
+    dilation_growth: int = 3
+    causal: bool = True  # False: the plain VAE of the ablation, which also looks ahead
+
+    @property
+    def frames_per_latent(self) -> int:
+        return 2**self.down
+
+
+@dataclass(frozen=True)
+class TextConfig:
+    """A word-level DistilBERT: tiny with its own vocabulary (`path=None`), or the real one from a local folder."""
+
+    path: str | None = None
+    dim: int = 768
+    layers: int = 6
+    heads: int = 12
+    vocab_size: int = 30522  # an upper bound: a vocabulary trained from few captions ends up smaller
+    max_words: int = 128  # word pieces per sentence, [CLS] and [SEP] counted; longer sentences are cut
+    dropout: float = 0.0
+    frozen: bool = True  # True: never trained and always in eval mode
+
+
+@dataclass(frozen=True)
+class DiTConfig:
+    """Causal-DiT (CMDM Table 10). The feed-forward width is always 2 * dim, as the counts of the table imply."""
+
+    latent_dim: int = 64
+    text_dim: int = 768
+    dim: int = 512
+    layers: int = 8
+    heads: int = 4
+    time_dim: int = 256
+    block_size: int = 1  # latents that see each other both ways: 1 is the paper's text, 3 the released code
+    attention: str = "causal"  # or "bidirectional"
+
+    @property
+    def feedforward_dim(self) -> int:
+        return 2 * self.dim
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How the two stages are trained; the defaults are the released recipe where it is known."""
+
+    seed: int = 0
+    bfloat16: bool = False  # autocast the forward pass; the weights and the optimiser stay float32
+    # stage 1: the VAE, on short crops
+    vae_steps: int = 150_000
+    vae_batch: int = 256
+    vae_lr: float = 2e-4
+    vae_warmup: int = 2_000
+    crop_frames: int = 64
+    kl_weight: float = 1e-4  # beta in front of an exact ELBO; see models/vae.py for the release's 8e-5
+    root_weight: float = 0.05
+    # stage 2: the denoiser, on whole clips
+    dit_steps: int = 150_000
+    dit_batch: int = 64
+    dit_lr: float = 2e-4
+    dit_warmup: int = 2_000
+    ema: float = 0.9999
+    text_drop: float = (
+        0.1  # how often a sample's sentence is replaced by "" so that guidance has a null branch
+    )
+    # both
+    betas: tuple[float, float] = (0.9, 0.99)
+    weight_decay: float = 1e-5
+    grad_clip: float = 1.0
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A whole system: what is built and how it is trained."""
+
+    name: str
+    vae: VAEConfig = field(default_factory=VAEConfig)
+    text: TextConfig = field(default_factory=TextConfig)
+    dit: DiTConfig = field(default_factory=DiTConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+    def __post_init__(self):
+        if self.vae.latent_dim != self.dit.latent_dim:
+            raise ValueError(
+                f"preset {self.name!r}: the VAE writes {self.vae.latent_dim} channels per latent "
+                f"but the DiT reads {self.dit.latent_dim}"
+            )
+        if self.text.dim != self.dit.text_dim:
+            raise ValueError(
+                f"preset {self.name!r}: the text encoder writes words of width {self.text.dim} "
+                f"but the DiT reads {self.dit.text_dim}"
+            )
+
+    def to_dict(self) -> dict:
+        """The preset as nested JSON-ready dictionaries (tuples become lists)."""
+        out = asdict(self)
+        out["train"]["betas"] = list(self.train.betas)
+        return out
+
+    @classmethod
+    def from_dict(cls, data: dict) -> "Preset":
+        """The inverse of `to_dict`. ValueError: an unknown or missing key, named with where it stood."""
+        _check_keys(cls, data, "preset")
+        parts = {"vae": VAEConfig, "text": TextConfig, "dit": DiTConfig, "train": TrainConfig}
+        for key, part in parts.items():
+            _check_keys(part, data[key], key)
+        train = {**data["train"], "betas": tuple(data["train"]["betas"])}
+        return cls(
+            name=data["name"],
+            vae=VAEConfig(**data["vae"]),
+            text=TextConfig(**data["text"]),
+            dit=DiTConfig(**data["dit"]),
+            train=TrainConfig(**train),
+        )
+
+
+def _check_keys(cls, data, where: str):
+    if not isinstance(data, dict):
+        raise ValueError(f"configuration {where!r}: expected a dictionary, got {type(data).__name__}")
+    expected, found = {f.name for f in fields(cls)}, set(data)
+    if expected != found:
+        raise ValueError(
+            f"configuration {where!r}: missing keys {sorted(expected - found)}, "
+            f"unknown keys {sorted(found - expected)}"
+        )
+
+
+def _paper(name: str, heads: int, layers: int, dim: int) -> Preset:
+    # The folder is looked for on this machine only; models/text.py says how to fill it.
+    return Preset(
+        name,
+        text=TextConfig(path="distilbert-base-uncased"),
+        dit=DiTConfig(dim=dim, layers=layers, heads=heads),
+    )
+
+
+PRESETS = {
+    # Small enough to ship (under 12 MB in float32) and to train on one core in under 40 minutes.
+    "toy": Preset(
+        "toy",
+        vae=VAEConfig(latent_dim=16, width=128, depth=2),
+        text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64, frozen=False),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=120, layers=6, heads=4),
+        train=TrainConfig(
+            vae_steps=4_000,
+            vae_batch=64,
+            vae_lr=1e-3,
+            vae_warmup=100,
+            kl_weight=1e-2,
+            dit_steps=8_000,
+            dit_lr=1e-3,
+            dit_warmup=300,
+            ema=0.999,
+            weight_decay=0.0,
+        ),
+    ),
+    # CMDM Table 10: heads, layers, dim, and 19.8, 38.7, 129.1, 304.6 million denoiser parameters.
+    "S": _paper("S", heads=2, layers=4, dim=512),
+    "M": _paper("M", heads=4, layers=8, dim=512),
+    "L": _paper("L", heads=6, layers=12, dim=768),
+    "XL": _paper("XL", heads=8, layers=16, dim=1024),
+}
+
+
+def preset(name: str) -> Preset:
+    """The preset of that name. ValueError: an unknown name, with the known ones."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}: expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]
