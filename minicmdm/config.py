@@ -26,7 +26,7 @@ class VAEConfig:
 
 @dataclass(frozen=True)
 class TextConfig:
-    """A word-level DistilBERT: tiny with its own vocabulary (`path=None`), or the real one from a local folder."""
+    """A word-level DistilBERT: tiny with its own vocabulary (`path=None`), or one from a local folder."""
 
     path: str | None = None
     dim: int = 768
@@ -40,7 +40,7 @@ class TextConfig:
 
 @dataclass(frozen=True)
 class DiTConfig:
-    """Causal-DiT (CMDM Table 10). The feed-forward width is always 2 * dim, as the counts of the table imply."""
+    """Causal-DiT (CMDM Table 10). The feed-forward width is always 2 * dim, as the table's counts imply."""
 
     latent_dim: int = 64
     text_dim: int = 768
@@ -76,9 +76,7 @@ class TrainConfig:
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
     ema: float = 0.9999
-    text_drop: float = (
-        0.1  # how often a sample's sentence is replaced by "" so that guidance has a null branch
-    )
+    text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
     # both
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 1e-5
@@ -143,11 +141,8 @@ def _check_keys(cls, data, where: str):
 
 def _paper(name: str, heads: int, layers: int, dim: int) -> Preset:
     # The folder is looked for on this machine only; models/text.py says how to fill it.
-    return Preset(
-        name,
-        text=TextConfig(path="distilbert-base-uncased"),
-        dit=DiTConfig(dim=dim, layers=layers, heads=heads),
-    )
+    text = TextConfig(path="distilbert-base-uncased")
+    return Preset(name, text=text, dit=DiTConfig(dim=dim, layers=layers, heads=heads))
 
 
 PRESETS = {

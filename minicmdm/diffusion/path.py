@@ -1,13 +1,13 @@
-"""The owner of the time convention: t = 0 is noise, t = 1 is data, and the path between them is a straight line.
+"""The owner of the time convention: t = 0 is noise, t = 1 is data, and a straight line joins them.
 
     z_t = t z + (1 - t) eps         v = dz_t/dt = z - eps
 
-Three predictions carry the same information, because two equations tie four unknowns (z, eps, v and the given z_t):
+Given z_t and t, the three predictions v, z and eps carry the same information:
 
     z = z_t + (1 - t) v             eps = z_t - t v
 
-The paper writes a DDPM that predicts eps at integer levels k, with k = K noise and k = 0 clean (CMDM Eqs 7-11); its
-released code trains the velocity v on this path. `level_to_time` is the only bridge between the two clocks.
+The paper writes a DDPM that predicts eps at integer levels k, with k = K noise and k = 0 clean (CMDM Eqs
+7-11); its released code trains the velocity on this path. `level_to_time` is the bridge between the clocks.
 
 Shapes everywhere: z, eps, v are (B,N,C); t is (B,N), one time per latent, or a plain number.
 """
@@ -48,16 +48,16 @@ def velocity_to_noise(z_t: Tensor, v: Tensor, t: Tensor | float) -> Tensor:
 
 
 def data_to_velocity(z_t: Tensor, z: Tensor, t: Tensor | float) -> Tensor:
-    """v from a prediction of the data, (z - z_t) / (1 - t). It has no answer at t = 1, where z_t is the data."""
+    """v from predicted data, (z - z_t) / (1 - t). No answer at t = 1, where z_t is the data itself."""
     return (z - z_t) / (1 - _column(t, z_t))
 
 
 def noise_to_velocity(z_t: Tensor, eps: Tensor, t: Tensor | float) -> Tensor:
-    """v from a prediction of the noise, (z_t - eps) / t. It has no answer at t = 0, where z_t is the noise."""
+    """v from predicted noise, (z_t - eps) / t. No answer at t = 0, where z_t is the noise itself."""
     return (z_t - eps) / _column(t, z_t)
 
 
 def euler_step(z_t: Tensor, v: Tensor, t_from: Tensor | float, t_to: Tensor | float) -> Tensor:
-    """One step along v. A latent with t_to = t_from is copied bit for bit, whatever v says there (even NaN)."""
+    """One step along v. A latent with t_to = t_from is copied bit for bit, whatever v says (even NaN)."""
     step = _column(t_to, z_t) - _column(t_from, z_t)
     return torch.where(step != 0, z_t + step * v, z_t)

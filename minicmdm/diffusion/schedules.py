@@ -9,10 +9,10 @@ A row is a moment, a column is a latent; going from one row to the next is one c
 L = 0 moves everything together (full-sequence diffusion), L = K starts a block when the one before it is
 finished (autoregressive), and the paper's frame-wise sampling schedule (FSS) is what lies between.
 
-CMDM Eq. 13 prints FSS rows K, K-L, K-2L, ... "intermediate steps omitted" and can be read two ways: latents that jump
-by L (K/L + N - 1 calls), or latents that take unit steps and are L steps apart (K + L (N - 1) calls). The sentence
-beneath it ("starts at K - L of the current frame") and the released code take the second, and so do we: L is a
-stagger, not a step size. For K = 4, L = 2 and three latents:
+CMDM Eq. 13 prints FSS rows K, K-L, K-2L, ... and omits the steps between. It can be read two ways: latents
+jump by L (K/L + N - 1 calls), or they take unit steps and are L steps apart (K + L (N - 1) calls). The
+sentence beneath it (the next frame starts when the current one is at K - L) and the released code take the
+second, and so do we: L is a stagger, not a step size. For K = 4, L = 2 and three latents:
 
     4 4 4 | 3 4 4 | 2 4 4 | 1 3 4 | 0 2 4 | 0 1 3 | 0 0 2 | 0 0 1 | 0 0 0
 """
@@ -30,7 +30,7 @@ def schedule_matrix(
     """The noise levels (M,N), int64, with M = K + L (ceil(N / block_size) - 1) + 1 rows (CMDM Eq. 13).
 
     `uncertainty` is read by "fss" alone: "full" is L = 0 and "autoregressive" is L = K by definition.
-    ValueError: an unknown kind, a count below 1, an uncertainty outside 0..num_steps, or anything not an integer.
+    ValueError: an unknown kind, a count below 1, an uncertainty outside 0..num_steps, or a non-integer.
     """
     if kind not in KINDS:
         raise ValueError(f"unknown schedule {kind!r}: expected one of {', '.join(KINDS)}")
@@ -45,8 +45,8 @@ def schedule_matrix(
         stagger = _integer("uncertainty", uncertainty, low=0)
         if stagger > num_steps:
             raise ValueError(
-                f"uncertainty must be at most num_steps ({num_steps}), got {stagger}: a block would still wait "
-                "after the one before it is finished"
+                f"uncertainty must be at most num_steps ({num_steps}), got {stagger}: "
+                "a block would still wait after the one before it is finished"
             )
     num_blocks = -(-num_latents // block_size)  # ceil(N / b)
     rows = num_steps + stagger * (num_blocks - 1) + 1
@@ -61,15 +61,13 @@ class ScheduleCost:
 
     rows: int  # M
     calls: int  # denoiser calls, M - 1; guidance doubles the batch of a call, not their number
-    latents_in_flight: (
-        int  # the most that move in one call: min(N, block_size * ceil(K / L)), or N when L = 0
-    )
+    latents_in_flight: int  # the most moved by one call: min(N, block_size * ceil(K / L)), or N when L = 0
     calls_to_first: int  # calls until the first latent is clean: K
     calls_per_further: float  # calls between one finished block and the next: L (0 if all finish together)
 
 
 def cost(matrix: np.ndarray) -> ScheduleCost:
-    """Count rows, calls and latents in flight of a scheduling matrix (M,N). ValueError: not a valid matrix."""
+    """Count rows, calls and latents in flight of a scheduling matrix (M,N). ValueError: not a valid one."""
     matrix = check_matrix(matrix)
     moving = matrix[1:] < matrix[:-1]  # (M-1,N): which latents each call moves
     finished_at = np.unique((matrix > 0).sum(axis=0))  # calls until each latent is clean, each value once
@@ -88,20 +86,16 @@ def check_matrix(matrix: np.ndarray) -> np.ndarray:
     levels = np.asarray(matrix)
     if levels.ndim != 2 or levels.shape[0] < 2 or levels.shape[1] < 1 or levels.dtype.kind not in "iu":
         raise ValueError(
-            f"a scheduling matrix is (rows >= 2, latents >= 1) of integers, got {levels.shape} of {levels.dtype}"
+            f"a scheduling matrix is integers (rows >= 2, latents >= 1), got {levels.shape} of {levels.dtype}"
         )
     levels = levels.astype(np.int64)
     if levels[0].min() != levels[0].max() or levels[0, 0] < 1:
-        raise ValueError(
-            f"every latent must start at the same level K >= 1, got first row {levels[0].tolist()}"
-        )
+        raise ValueError(f"every latent must start at the same level K >= 1, got {levels[0].tolist()}")
     if levels[-1].any():
-        raise ValueError(f"every latent must end clean (level 0), got last row {levels[-1].tolist()}")
+        raise ValueError(f"every latent must end clean (level 0), got {levels[-1].tolist()}")
     if (np.diff(levels, axis=0) > 0).any():
         row, latent = np.argwhere(np.diff(levels, axis=0) > 0)[0]
-        raise ValueError(
-            f"a noise level may never rise, but latent {latent} rises from row {row} to row {row + 1}"
-        )
+        raise ValueError(f"a noise level may never rise, but latent {latent} rises after row {row}")
     return levels
 
 

@@ -1,0 +1,132 @@
+"""The bricks: causal convolution for the VAE; rotary attention, RMSNorm and modulation for the DiT."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+
+class CausalConv1d(nn.Module):
+    """A convolution over time that pads only on the left, so output i never sees input after its own group.
+
+    With stride s the left padding is (k-1)*dilation + 1-s: the output has T/s frames, and output i sees
+    inputs up to s*i + s-1, the last frame of its group. `causal=False` splits the same padding over both
+    sides, which is the ordinary convolution of the ablation. (B,C_in,T) -> (B,C_out,T/s).
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        out_channels: int,
+        kernel_size: int,
+        stride: int = 1,
+        dilation: int = 1,
+        causal: bool = True,
+    ):
+        super().__init__()
+        self.conv = nn.Conv1d(in_channels, out_channels, kernel_size, stride=stride, dilation=dilation)
+        total = (kernel_size - 1) * dilation + 1 - stride
+        right = 0 if causal else total // 2
+        self.padding = (total - right, right)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.conv(F.pad(x, self.padding))
+
+
+class ResidualBlock(nn.Module):
+    """ReLU, dilated k3 convolution, ReLU, k1 convolution, plus the input. (B,C,T) -> (B,C,T)."""
+
+    def __init__(self, channels: int, dilation: int, causal: bool = True):
+        super().__init__()
+        self.dilated = CausalConv1d(channels, channels, 3, dilation=dilation, causal=causal)
+        self.mix = CausalConv1d(channels, channels, 1, causal=causal)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.mix(F.relu(self.dilated(F.relu(x))))
+
+
+class RMSNorm(nn.Module):
+    """Divide by the root mean square of the last axis, then scale. Any shape (..., dim)."""
+
+    def __init__(self, dim: int, eps: float = 1e-6):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(dim))
+        self.eps = eps
+
+    def forward(self, x: Tensor) -> Tensor:
+        # The power of two happens in float32 even under autocast, where x may be bfloat16.
+        wide = x if x.dtype == torch.float64 else x.float()
+        return (wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + self.eps)).to(x.dtype) * self.weight
+
+
+def modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    """AdaLN: x (1 + scale) + shift, each latent with its own shift and scale. All (B,N,dim)."""
+    return x * (1 + scale) + shift
+
+
+def sinusoid(t: Tensor, dim: int) -> Tensor:
+    """Cosines and sines of t at dim/2 frequencies from 1 to 1/10000. (B,N) -> (B,N,dim)."""
+    half = dim // 2
+    exponent = torch.arange(half, device=t.device, dtype=t.dtype) / half
+    angle = t.unsqueeze(-1) * 10_000.0**-exponent  # (B,N,dim/2)
+    return torch.cat([angle.cos(), angle.sin()], dim=-1)
+
+
+def rotate(x: Tensor, positions: Tensor) -> Tensor:
+    """Rotary position embedding (RoPE): turn channel pairs by an angle proportional to the position.
+
+    A dot product of two rotated vectors depends on the difference of their positions only. Nothing is
+    tabled, so there is no longest sequence. x (B,H,N,d) with d even, positions (N,).
+    """
+    half = x.shape[-1] // 2
+    dtype = x.dtype if x.dtype == torch.float64 else torch.float32
+    exponent = torch.arange(half, device=x.device, dtype=dtype) / half
+    angle = positions.to(dtype)[:, None] * 10_000.0**-exponent  # (N,d/2)
+    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    a, b = x[..., :half], x[..., half:]
+    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
+
+
+class Attention(nn.Module):
+    """Multi-head attention of x over a context, under an explicit mask: True where a query may look.
+
+    Self-attention passes x as its own context and gives positions, which rotate queries and keys;
+    cross-attention gives none. Queries and keys are RMS-normalised over the full width. Keys and values
+    come from one method, so that a stream can compute them once and keep them.
+    """
+
+    def __init__(self, dim: int, heads: int):
+        super().__init__()
+        if dim % (2 * heads):
+            raise ValueError(f"dim must be a multiple of 2 * heads (RoPE turns pairs), got {dim} and {heads}")
+        self.heads = heads
+        self.query, self.key, self.value, self.out = (nn.Linear(dim, dim) for _ in range(4))
+        self.query_norm, self.key_norm = RMSNorm(dim), RMSNorm(dim)
+
+    def split(self, x: Tensor) -> Tensor:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)  # (B,N,dim) -> (B,H,N,d)
+
+    def keys_values(self, context: Tensor, positions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Keys and values (B,H,S,d) of a context (B,S,dim) whose entries stand at `positions` (S,)."""
+        keys, values = self.split(self.key_norm(self.key(context))), self.split(self.value(context))
+        return (keys if positions is None else rotate(keys, positions)), values
+
+    def attend(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, positions=None) -> Tensor:
+        """x (B,N,dim) looks at keys and values (B,H,S,d) where mask (N,S) or (B,N,S) is True -> (B,N,dim)."""
+        queries = self.split(self.query_norm(self.query(x)))
+        if positions is not None:
+            queries = rotate(queries, positions)
+        if mask is not None:
+            mask = (
+                mask if mask.ndim == 2 else mask.unsqueeze(1)
+            )  # (B,N,S) -> (B,1,N,S): the same for all heads
+            sees_any = mask.any(-1, keepdim=True)
+            # The softmax of nothing is NaN: a blind query looks at everything, then its answer is set to
+            # zero.
+            mask = mask | ~sees_any
+        out = F.scaled_dot_product_attention(queries, keys, values, attn_mask=mask)  # (B,H,N,d)
+        if mask is not None:
+            out = out * sees_any
+        return self.out(out.transpose(1, 2).flatten(2))  # (B,N,dim)
+
+    def forward(self, x: Tensor, context: Tensor, mask: Tensor | None, positions=None) -> Tensor:
+        return self.attend(x, *self.keys_values(context, positions), mask, positions)
