@@ -197,8 +197,8 @@ def _chain_rotations(joints: np.ndarray, start: np.ndarray) -> np.ndarray:
 def canonicalize(joints: np.ndarray, retarget: bool = False, floor: bool = False) -> np.ndarray:
     """Move and turn joints (T, 22, 3) so that frame 0 stands at x = z = 0 and faces +Z; heights stay.
 
-    retarget=True first gives the body HumanML3D's bone lengths; floor=True moves the whole clip up or down until
-    its lowest joint is at y = 0.
+    retarget=True first gives the body HumanML3D's bone lengths; floor=True moves the whole clip up or down
+    until its lowest joint is at y = 0.
     """
     joints, dtype = _checked_joints(joints)
     if retarget:
