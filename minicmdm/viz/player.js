@@ -1,0 +1,272 @@
+// Plays skeletons on canvases: drag to orbit, wheel to zoom, scrub, play, change speed. No library, no network.
+//
+// minicmdmPlayer(root, data) fills the element `root` and returns {seek, play, pause, destroy}. `data` is
+//   {fps, parents: [22], sides: [22] ("left" | "right" | "middle"),
+//    clips: [{caption, frames, scale, joints}]}   joints: base64 of int16 (frames, 22, 3), times scale = metres.
+// A page calls it from a script tag; a notebook widget appends `export default {render}` and calls it from there.
+// root.dataset.frame holds the frame on show, for tests.
+
+function minicmdmPlayer(root, data) {
+  "use strict";
+  const COLOURS = { left: "#e07a1f", right: "#2563c9", middle: "#454b57" };
+  const HOME = { yaw: 0.6, pitch: 0.22, distance: 4.4 };
+  const SPEEDS = [0.25, 0.5, 1, 2];
+  const clips = data.clips.map((clip) => ({ ...clip, joints: decode(clip.joints, clip.scale) }));
+  const frames = Math.max(...clips.map((clip) => clip.frames));
+  const view = { ...HOME };
+  let now = 0; // in frames; between two of them while playing
+  let speed = 1;
+  let playing = false;
+  let trail = true;
+  let lastTick = 0;
+  let request = 0;
+
+  function decode(text, scale) {
+    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const numbers = new DataView(bytes.buffer);
+    const values = new Float32Array(bytes.length / 2);
+    for (let i = 0; i < values.length; i++) values[i] = numbers.getInt16(2 * i, true) * scale;
+    return values;
+  }
+
+  // ---- the page: one canvas per clip, one row of controls ----------------------------------------------------
+  function make(tag, parent, style, attributes) {
+    const element = document.createElement(tag);
+    Object.assign(element.style, style || {});
+    for (const [name, value] of Object.entries(attributes || {})) element.setAttribute(name, value);
+    parent.appendChild(element);
+    return element;
+  }
+
+  root.replaceChildren();
+  root.tabIndex = 0;
+  root.setAttribute("aria-label", "Motion player: space plays, arrow keys step, drag orbits, wheel zooms");
+  Object.assign(root.style, { font: "14px system-ui, sans-serif", color: "#1f2430", outlineOffset: "2px" });
+  const stage = make("div", root, {
+    display: "grid", gap: "10px",
+    gridTemplateColumns: `repeat(${Math.min(clips.length, 4)}, minmax(0, 1fr))`,
+  });
+  for (const clip of clips) {
+    const figure = make("figure", stage, { margin: "0", display: "flex", flexDirection: "column" });
+    const caption = make("figcaption", figure, { padding: "4px 2px", minHeight: "1.3em", flex: "1" });
+    caption.textContent = clip.caption; // as text, so a caption can never become markup
+    clip.canvas = make("canvas", figure, {
+      width: "100%", aspectRatio: clips.length > 1 ? "1 / 1" : "16 / 10", borderRadius: "8px",
+      background: "#f5f6f8", cursor: "grab", touchAction: "none", display: "block",
+    }, { role: "img", "aria-label": `Skeleton: ${clip.caption}` });
+  }
+  const bar = make("div", root, {
+    display: "flex", gap: "10px", alignItems: "center", padding: "8px 0", flexWrap: "wrap",
+  });
+  const playButton = make("button", bar, { width: "5.5em", padding: "4px 0" }, { type: "button" });
+  const slider = make("input", bar, { flex: "1 1 160px" }, {
+    type: "range", min: 0, max: frames - 1, step: 1, value: 0, "aria-label": "Frame",
+  });
+  const clock = make("output", bar, { minWidth: "11em", fontVariantNumeric: "tabular-nums" });
+  const speedMenu = make("select", bar, {}, { "aria-label": "Speed" });
+  for (const value of SPEEDS) make("option", speedMenu, {}, { value }).textContent = `${value}×`;
+  speedMenu.value = speed;
+  const trailLabel = make("label", bar, { whiteSpace: "nowrap" });
+  const trailBox = make("input", trailLabel, {}, { type: "checkbox" });
+  trailBox.checked = trail;
+  trailLabel.append(" trail");
+  const homeButton = make("button", bar, { padding: "4px 8px" }, { type: "button" });
+  homeButton.textContent = "reset view";
+  const legend = make("span", bar, { whiteSpace: "nowrap" });
+  for (const side of ["left", "right"]) {
+    make("b", legend, { color: COLOURS[side], marginRight: "8px" }).textContent = side;
+  }
+
+  // ---- the camera: turns about a point above the root's place on the floor -----------------------------------
+  function camera(clip, pose) {
+    const { width, height } = clip.canvas;
+    const focal = Math.min(width, height) * 1.35;
+    const [cosYaw, sinYaw] = [Math.cos(view.yaw), Math.sin(view.yaw)];
+    const [cosPitch, sinPitch] = [Math.cos(view.pitch), Math.sin(view.pitch)];
+    return (x, y, z) => {
+      const [dx, dy, dz] = [x - pose[0], y - 0.85, z - pose[2]];
+      const right = cosYaw * dx - sinYaw * dz;
+      const near = sinYaw * dx + cosYaw * dz;
+      const away = view.distance - sinPitch * dy - cosPitch * near; // distance along the line of sight
+      const size = focal / Math.max(away, 0.05);
+      return { x: width / 2 + right * size, y: height / 2 - (cosPitch * dy - sinPitch * near) * size, away, size };
+    };
+  }
+
+  function line(context, a, b, colour, width) {
+    if (a.away < 0.2 || b.away < 0.2) return; // behind the lens
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.beginPath();
+    context.moveTo(a.x, a.y);
+    context.lineTo(b.x, b.y);
+    context.stroke();
+  }
+
+  function poseAt(clip, time) {
+    const last = clip.frames - 1;
+    const first = Math.min(Math.floor(time), last);
+    const second = Math.min(first + 1, last);
+    const part = Math.min(time, last) - first;
+    const pose = new Float32Array(66);
+    for (let i = 0; i < 66; i++) {
+      pose[i] = clip.joints[66 * first + i] * (1 - part) + clip.joints[66 * second + i] * part;
+    }
+    return pose;
+  }
+
+  // ---- drawing -----------------------------------------------------------------------------------------------
+  function drawFloor(context, project, pose, pixel) {
+    const [cell, reach] = [0.5, 7]; // half a metre; 7 cells each way, fading out
+    const [x0, z0] = [Math.round(pose[0] / cell), Math.round(pose[2] / cell)];
+    for (let i = -reach; i <= reach; i++) {
+      for (let k = -reach; k < reach; k++) {
+        for (const alongX of [true, false]) {
+          const [ax, az] = alongX ? [x0 + k, z0 + i] : [x0 + i, z0 + k];
+          const [bx, bz] = alongX ? [ax + 1, az] : [ax, az + 1];
+          const [midX, midZ] = [((ax + bx) * cell) / 2, ((az + bz) * cell) / 2];
+          const fade = 1 - Math.hypot(midX - pose[0], midZ - pose[2]) / (reach * cell);
+          if (fade <= 0) continue;
+          const strong = (alongX ? az : ax) % 2 === 0; // every metre
+          const colour = `rgba(120, 128, 145, ${(strong ? 0.6 : 0.25) * Math.sqrt(fade)})`;
+          line(context, project(ax * cell, 0, az * cell), project(bx * cell, 0, bz * cell), colour, pixel);
+        }
+      }
+    }
+  }
+
+  function drawClip(clip) {
+    const context = clip.canvas.getContext("2d");
+    const pixel = window.devicePixelRatio || 1;
+    const pose = poseAt(clip, now);
+    const project = camera(clip, pose);
+    const at = (j) => project(pose[3 * j], pose[3 * j + 1], pose[3 * j + 2]);
+    const shadow = (j) => project(pose[3 * j], 0, pose[3 * j + 2]);
+    context.clearRect(0, 0, clip.canvas.width, clip.canvas.height);
+    context.lineCap = "round";
+    drawFloor(context, project, pose, pixel);
+
+    if (trail) { // where the root has been and will go, on the floor
+      const place = (t) => project(clip.joints[66 * t], 0, clip.joints[66 * t + 2]);
+      for (let t = 1; t < clip.frames; t++) {
+        line(context, place(t - 1), place(t), `rgba(180, 40, 90, ${t <= now ? 0.8 : 0.22})`, 2 * pixel);
+      }
+    }
+    const bones = [];
+    for (let j = 1; j < 22; j++) bones.push([data.parents[j], j]);
+    for (const [p, j] of bones) { // a shadow straight below shows at once what floats or sinks
+      line(context, shadow(p), shadow(j), "rgba(30, 35, 50, 0.13)", 0.05 * shadow(j).size);
+    }
+    bones.sort((a, b) => at(b[0]).away + at(b[1]).away - at(a[0]).away - at(a[1]).away); // far ones first
+    for (const [p, j] of bones) line(context, at(p), at(j), COLOURS[data.sides[j]], 0.038 * at(j).size);
+    const head = at(15);
+    if (head.away > 0.2) {
+      context.fillStyle = COLOURS.middle;
+      context.beginPath();
+      context.arc(head.x, head.y, 0.085 * head.size, 0, 7);
+      context.fill();
+    }
+  }
+
+  function draw() {
+    for (const clip of clips) {
+      const pixel = window.devicePixelRatio || 1;
+      const width = Math.round(clip.canvas.clientWidth * pixel);
+      const height = Math.round(clip.canvas.clientHeight * pixel);
+      if (clip.canvas.width !== width || clip.canvas.height !== height) {
+        clip.canvas.width = width;
+        clip.canvas.height = height;
+      }
+      if (width > 0 && height > 0) drawClip(clip);
+    }
+    const frame = Math.floor(now);
+    root.dataset.frame = frame;
+    slider.value = frame;
+    clock.textContent = `frame ${frame} of ${frames - 1}, ${(now / data.fps).toFixed(2)} s`;
+    playButton.textContent = playing ? "pause" : "play";
+  }
+
+  function tick(time) {
+    if (!playing) return;
+    if (!root.isConnected && lastTick) return pause(); // the notebook cell was closed
+    if (lastTick) now += ((time - lastTick) / 1000) * data.fps * speed;
+    lastTick = time;
+    if (now > frames - 1) now = 0;
+    draw();
+    request = requestAnimationFrame(tick);
+  }
+
+  function play() {
+    if (playing || frames < 2) return;
+    playing = true;
+    lastTick = 0;
+    request = requestAnimationFrame(tick);
+    draw();
+  }
+
+  function pause() {
+    playing = false;
+    cancelAnimationFrame(request);
+    now = Math.floor(now);
+    draw();
+  }
+
+  function seek(frame) {
+    pause();
+    now = Math.min(Math.max(Math.round(frame), 0), frames - 1);
+    draw();
+  }
+
+  // ---- hands on it -------------------------------------------------------------------------------------------
+  playButton.onclick = () => (playing ? pause() : play());
+  slider.oninput = () => seek(Number(slider.value));
+  speedMenu.onchange = () => (speed = Number(speedMenu.value));
+  trailBox.onchange = () => { trail = trailBox.checked; draw(); };
+  homeButton.onclick = () => { Object.assign(view, HOME); draw(); };
+  for (const { canvas } of clips) {
+    canvas.onpointerdown = (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      root.focus({ preventScroll: true });
+    };
+    canvas.onpointermove = (event) => {
+      if (!canvas.hasPointerCapture(event.pointerId)) return;
+      view.yaw -= event.movementX * 0.01;
+      view.pitch = Math.min(Math.max(view.pitch + event.movementY * 0.01, -0.1), 1.55);
+      draw();
+    };
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      view.distance = Math.min(Math.max(view.distance * Math.exp(event.deltaY * 0.001), 1.5), 20);
+      draw();
+    }, { passive: false });
+  }
+  const keys = {
+    " ": () => (playing ? pause() : play()),
+    ArrowRight: () => seek(Math.floor(now) + 1),
+    ArrowLeft: () => seek(Math.floor(now) - 1),
+    Home: () => seek(0),
+    End: () => seek(frames - 1),
+    r: () => homeButton.onclick(),
+    t: () => { trailBox.checked = !trailBox.checked; trailBox.onchange(); },
+  };
+  function onKey(event) {
+    event.stopPropagation(); // or JupyterLab takes the key for itself
+    const pressesIt = event.key === " " && event.target !== root && event.target !== slider; // a button or a box
+    if (pressesIt || event.target === speedMenu) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
+    event.preventDefault();
+    keys[event.key]();
+  }
+  root.addEventListener("keydown", onKey);
+  const resized = new ResizeObserver(draw);
+  resized.observe(root);
+  draw();
+
+  function destroy() {
+    pause();
+    resized.disconnect();
+    root.removeEventListener("keydown", onKey);
+    root.replaceChildren();
+  }
+  return { seek, play, pause, destroy };
+}
