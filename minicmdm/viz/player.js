@@ -2,14 +2,14 @@
 //
 // minicmdmPlayer(root, data) fills the element `root` and returns {seek, play, pause, destroy}. `data` is
 //   {fps, parents: [22], sides: [22] ("left" | "right" | "middle"),
-//    clips: [{caption, frames, scale, joints}]}   joints: base64 of int16 (frames, 22, 3), times scale = metres.
-// A page calls it from a script tag; a notebook widget appends `export default {render}` and calls it from there.
+//    clips: [{caption, frames, scale, joints}]}   joints: base64 of int16 (frames, 22, 3); times scale: metres.
+// A page calls it from a script tag; a notebook widget appends `export default {render}` and calls it there.
 // root.dataset.frame holds the frame on show, for tests.
 
 function minicmdmPlayer(root, data) {
   "use strict";
   const COLOURS = { left: "#e07a1f", right: "#2563c9", middle: "#454b57" };
-  const HOME = { yaw: 0.6, pitch: 0.22, distance: 4.4 };
+  const HOME = { yaw: 0.6, pitch: 0.22, distance: 3.9 };
   const SPEEDS = [0.25, 0.5, 1, 2];
   const clips = data.clips.map((clip) => ({ ...clip, joints: decode(clip.joints, clip.scale) }));
   const frames = Math.max(...clips.map((clip) => clip.frames));
@@ -29,7 +29,7 @@ function minicmdmPlayer(root, data) {
     return values;
   }
 
-  // ---- the page: one canvas per clip, one row of controls ----------------------------------------------------
+  // ---- the page: one canvas per clip, one row of controls ---------------------------------------------
   function make(tag, parent, style, attributes) {
     const element = document.createElement(tag);
     Object.assign(element.style, style || {});
@@ -51,8 +51,8 @@ function minicmdmPlayer(root, data) {
     const caption = make("figcaption", figure, { padding: "4px 2px", minHeight: "1.3em", flex: "1" });
     caption.textContent = clip.caption; // as text, so a caption can never become markup
     clip.canvas = make("canvas", figure, {
-      width: "100%", aspectRatio: clips.length > 1 ? "1 / 1" : "16 / 10", borderRadius: "8px",
-      background: "#f5f6f8", cursor: "grab", touchAction: "none", display: "block",
+      width: "100%", aspectRatio: clips.length > 1 ? "1 / 1" : "16 / 10", maxHeight: "calc(100vh - 120px)",
+      borderRadius: "8px", background: "#f5f6f8", cursor: "grab", touchAction: "none", display: "block",
     }, { role: "img", "aria-label": `Skeleton: ${clip.caption}` });
   }
   const bar = make("div", root, {
@@ -77,7 +77,7 @@ function minicmdmPlayer(root, data) {
     make("b", legend, { color: COLOURS[side], marginRight: "8px" }).textContent = side;
   }
 
-  // ---- the camera: turns about a point above the root's place on the floor -----------------------------------
+  // ---- the camera: turns about a point above the root's place on the floor ----------------------------
   function camera(clip, pose) {
     const { width, height } = clip.canvas;
     const focal = Math.min(width, height) * 1.35;
@@ -89,17 +89,20 @@ function minicmdmPlayer(root, data) {
       const near = sinYaw * dx + cosYaw * dz;
       const away = view.distance - sinPitch * dy - cosPitch * near; // distance along the line of sight
       const size = focal / Math.max(away, 0.05);
-      return { x: width / 2 + right * size, y: height / 2 - (cosPitch * dy - sinPitch * near) * size, away, size };
+      const up = cosPitch * dy - sinPitch * near;
+      return { x: width / 2 + right * size, y: height / 2 - up * size, away, size };
     };
   }
 
-  function line(context, a, b, colour, width) {
-    if (a.away < 0.2 || b.away < 0.2) return; // behind the lens
+  function lines(context, pairs, colour, width) { // in one stroke, so that where they cross is no darker
     context.strokeStyle = colour;
     context.lineWidth = width;
     context.beginPath();
-    context.moveTo(a.x, a.y);
-    context.lineTo(b.x, b.y);
+    for (const [a, b] of pairs) {
+      if (a.away < 0.2 || b.away < 0.2) continue; // behind the lens
+      context.moveTo(a.x, a.y);
+      context.lineTo(b.x, b.y);
+    }
     context.stroke();
   }
 
@@ -115,7 +118,7 @@ function minicmdmPlayer(root, data) {
     return pose;
   }
 
-  // ---- drawing -----------------------------------------------------------------------------------------------
+  // ---- drawing ----------------------------------------------------------------------------------------
   function drawFloor(context, project, pose, pixel) {
     const [cell, reach] = [0.5, 7]; // half a metre; 7 cells each way, fading out
     const [x0, z0] = [Math.round(pose[0] / cell), Math.round(pose[2] / cell)];
@@ -129,7 +132,7 @@ function minicmdmPlayer(root, data) {
           if (fade <= 0) continue;
           const strong = (alongX ? az : ax) % 2 === 0; // every metre
           const colour = `rgba(120, 128, 145, ${(strong ? 0.6 : 0.25) * Math.sqrt(fade)})`;
-          line(context, project(ax * cell, 0, az * cell), project(bx * cell, 0, bz * cell), colour, pixel);
+          lines(context, [[project(ax * cell, 0, az * cell), project(bx * cell, 0, bz * cell)]], colour, pixel);
         }
       }
     }
@@ -148,17 +151,17 @@ function minicmdmPlayer(root, data) {
 
     if (trail) { // where the root has been and will go, on the floor
       const place = (t) => project(clip.joints[66 * t], 0, clip.joints[66 * t + 2]);
-      for (let t = 1; t < clip.frames; t++) {
-        line(context, place(t - 1), place(t), `rgba(180, 40, 90, ${t <= now ? 0.8 : 0.22})`, 2 * pixel);
-      }
+      const [past, future] = [[], []];
+      for (let t = 1; t < clip.frames; t++) (t <= now ? past : future).push([place(t - 1), place(t)]);
+      lines(context, future, "rgba(180, 40, 90, 0.25)", 2 * pixel);
+      lines(context, past, "rgba(180, 40, 90, 0.8)", 2 * pixel);
     }
     const bones = [];
     for (let j = 1; j < 22; j++) bones.push([data.parents[j], j]);
-    for (const [p, j] of bones) { // a shadow straight below shows at once what floats or sinks
-      line(context, shadow(p), shadow(j), "rgba(30, 35, 50, 0.13)", 0.05 * shadow(j).size);
-    }
+    // A shadow straight below shows at once what floats or sinks.
+    lines(context, bones.map(([p, j]) => [shadow(p), shadow(j)]), "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
     bones.sort((a, b) => at(b[0]).away + at(b[1]).away - at(a[0]).away - at(a[1]).away); // far ones first
-    for (const [p, j] of bones) line(context, at(p), at(j), COLOURS[data.sides[j]], 0.038 * at(j).size);
+    for (const [p, j] of bones) lines(context, [[at(p), at(j)]], COLOURS[data.sides[j]], 0.038 * at(j).size);
     const head = at(15);
     if (head.away > 0.2) {
       context.fillStyle = COLOURS.middle;
@@ -217,7 +220,7 @@ function minicmdmPlayer(root, data) {
     draw();
   }
 
-  // ---- hands on it -------------------------------------------------------------------------------------------
+  // ---- hands on it ------------------------------------------------------------------------------------
   playButton.onclick = () => (playing ? pause() : play());
   slider.oninput = () => seek(Number(slider.value));
   speedMenu.onchange = () => (speed = Number(speedMenu.value));
@@ -251,7 +254,7 @@ function minicmdmPlayer(root, data) {
   };
   function onKey(event) {
     event.stopPropagation(); // or JupyterLab takes the key for itself
-    const pressesIt = event.key === " " && event.target !== root && event.target !== slider; // a button or a box
+    const pressesIt = event.key === " " && event.target !== root && event.target !== slider; // a button, a box
     if (pressesIt || event.target === speedMenu) return;
     if (event.ctrlKey || event.metaKey || event.altKey || !(event.key in keys)) return;
     event.preventDefault();

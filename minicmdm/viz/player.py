@@ -1,7 +1,7 @@
 """A web page that plays motions: one file, no network, opened by a double click.
 
-The drawing lives in player.js. Here the joints are packed small (two bytes a number; a minute of motion is some
-210 kB of text) and everything is put into one page, so that a caption can never become part of the markup.
+The drawing lives in player.js. Here the joints are packed small (two bytes a number; a minute of motion is
+some 210 kB of text) and everything is put into one page, where a caption can never become markup.
 """
 
 from __future__ import annotations
