@@ -51,7 +51,9 @@ def check_output(path: str | Path, endings: tuple[str, ...], force: bool = False
     if not path.parent.is_dir():
         raise FileNotFoundError(f"the folder {path.parent} for the output {path.name} does not exist: make it first")
     if path.exists() and not force:
-        raise FileExistsError(f"the output {text} exists already and was left as it is: --force (force=True) replaces it")
+        raise FileExistsError(
+            f"the output {text} exists already and was left as it is: --force (force=True) replaces it"
+        )
     try:
         with tempfile.TemporaryFile(dir=path.parent):
             pass

@@ -1,0 +1,201 @@
+"""From a sentence to a motion: tokenise, sample latents under a schedule, decode, recover the joints.
+
+    pipe = MotionPipeline.from_pretrained("toy")
+    motion = pipe("a person walks, then waves the left hand", num_frames=120, seed=0)
+
+A motion depends on its own prompt, length and seed, and never on what else is in its batch: each prompt has its own
+generator, and the noise for the longest motion is drawn first and then cut. As the model is causal, a longer motion
+of the same prompt and seed therefore begins like the shorter one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import minicmdm
+from minicmdm.data.features import features_to_joints
+from minicmdm.diffusion.sampling import guided, sample
+from minicmdm.diffusion.schedules import schedule_matrix
+from minicmdm.motion import Motion
+from minicmdm.training import checkpoints
+
+MIN_FRAMES, MAX_FRAMES = 4, 196  # one latent, and the longest motion of HumanML3D (9.8 s)
+MAX_STEPS = 1000
+MAX_GUIDANCE = 100.0
+TOGETHER = 64  # how many motions are sampled in one batch
+ASSETS = Path(minicmdm.__file__).parent / "assets"
+
+
+class MotionPipeline:
+    """The front door: a checkpoint that answers sentences with motions."""
+
+    def __init__(self, checkpoint: checkpoints.Checkpoint):
+        self.preset = checkpoint.preset
+        self.vae = checkpoint.vae
+        self.dit = checkpoint.dit
+        self.text = checkpoint.text
+        self.stats = checkpoint.stats
+        self.card = checkpoint.card
+
+    @classmethod
+    def from_pretrained(cls, name: str | Path = "toy") -> MotionPipeline:
+        """Load the shipped checkpoint by its name, "toy", or any checkpoint by its folder.
+
+        Raises FileNotFoundError or ValueError where there is none, or one that is cut short, changed or foreign.
+        """
+        if not str(name).strip():
+            raise ValueError('the checkpoint name is empty: give "toy" or a folder made by `minicmdm train --out`')
+        folder = Path(name)
+        if str(name) == "toy" and not (folder / "card.json").is_file():
+            folder = ASSETS / "toy"
+        return cls(checkpoints.load_checkpoint(folder))
+
+    def save_pretrained(self, folder: str | Path) -> Path:
+        """Write the checkpoint (weights, text encoder, statistics, card) into a folder, made if missing."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        checkpoints.save_vae(folder, self.vae, self.stats)
+        checkpoints.save_denoiser(folder, self.dit, self.text)
+        facts = {key: value for key, value in self.card.items() if key not in ("format", "preset", "files")}
+        checkpoints.write_card(folder, self.preset, facts)
+        return folder
+
+    def __call__(
+        self,
+        prompt: str | Sequence[str],
+        num_frames: int | Sequence[int] = 120,
+        *,
+        schedule: str = "fss",
+        num_steps: int = 20,
+        uncertainty: int = 2,
+        guidance_scale: float = 3.0,
+        block_size: int | None = None,
+        seed: int | Sequence[int] = 0,
+    ) -> Motion | list[Motion]:
+        """Generate a Motion for a prompt, or a list of them for a list of prompts.
+
+        `num_frames` (4..196 at 20 fps) and `seed` are one for all or one for each. `schedule` is "fss", "full" or
+        "autoregressive", with K = `num_steps` and L = `uncertainty`; `block_size` is the model's own unless given.
+        Raises ValueError for anything that cannot be asked.
+        """
+        single = isinstance(prompt, str)
+        prompts = [prompt] if single else _as_list(prompt, "prompt", "a string or a list of strings")
+        for text in prompts:
+            self._check_prompt(text)
+        frames = [_check_frames(n) for n in _spread(num_frames, len(prompts), "num_frames")]
+        seeds = [_integer(s, "seed", 0, 2**63 - 1) for s in _spread(seed, len(prompts), "seed")]
+        num_steps = _integer(num_steps, "num_steps", 1, MAX_STEPS)
+        scale = _check_guidance(guidance_scale)
+        block_size = self.preset.dit.block_size if block_size is None else _integer(block_size, "block_size", 1, 49)
+        schedule_matrix(1, num_steps, uncertainty, block_size, schedule)  # refuse a bad schedule before any work
+
+        motions: dict[int, Motion] = {}
+        order = sorted(range(len(prompts)), key=lambda i: frames[i])
+        for first in range(0, len(order), TOGETHER):
+            chosen = order[first : first + TOGETHER]
+            counts = [-(-frames[i] // 4) for i in chosen]  # latents: frames / 4, rounded up
+            noise = torch.stack([self._noise(seeds[i], max(counts)) for i in chosen])  # (B,N,C)
+            valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]  # (B,N)
+            matrix = schedule_matrix(max(counts), num_steps, uncertainty, block_size, schedule)
+            features = self._generate([prompts[i] for i in chosen], noise, valid, matrix, scale)  # (B,T,D)
+            for i, one in zip(chosen, features):
+                one = one[: frames[i]].copy()
+                joints = features_to_joints(one).astype(np.float32)  # (T,22,3)
+                motions[i] = Motion(joints, one, prompts[i])
+        return motions[0] if single else [motions[i] for i in range(len(prompts))]
+
+    @torch.no_grad()
+    def _generate(
+        self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float
+    ) -> np.ndarray:
+        batch, num_latents, _ = noise.shape
+        words = self.text.encode(prompts)  # (B,S,E), (B,S)
+        null = self.text.encode([""])  # (1,2,E): what the model saw when its text was dropped
+        mask = words.mask[:, None, :].expand(-1, num_latents, -1)  # (B,N,S): every latent sees the whole sentence
+        null_mask = null.mask[:, None, :].expand(batch, num_latents, -1)
+        null_words = null.embeddings.expand(batch, -1, -1)
+        denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid)
+        latents = sample(denoise, matrix, noise)  # (B,N,C)
+        return self.decode(latents).numpy()
+
+    @torch.no_grad()
+    def encode(self, features: np.ndarray | Tensor) -> Tensor:
+        """Features (B,T,D), T a multiple of 4 -> normalised latents (B,N,C), the posterior means."""
+        x = (torch.as_tensor(features, dtype=torch.float32) - self.stats["feature_mean"]) / self.stats["feature_std"]
+        return (self.vae.encode(x)[0] - self.stats["latent_mean"]) / self.stats["latent_std"]
+
+    @torch.no_grad()
+    def decode(self, latents: Tensor) -> Tensor:
+        """Normalised latents (B,N,C) -> features (B,4N,D)."""
+        x = self.vae.decode(latents * self.stats["latent_std"] + self.stats["latent_mean"])
+        return x * self.stats["feature_std"] + self.stats["feature_mean"]
+
+    def reconstruct(self, features: np.ndarray) -> np.ndarray:
+        """One clip (T,D) through the VAE and back, cut to a multiple of 4 frames. (T',D)"""
+        whole = len(features) // 4 * 4
+        return self.decode(self.encode(features[None, :whole]))[0].numpy()
+
+    def _noise(self, seed: int, num_latents: int) -> Tensor:
+        generator = torch.Generator().manual_seed(seed)
+        longest = -(-MAX_FRAMES // 4)
+        return torch.randn(longest, self.preset.dit.latent_dim, generator=generator)[:num_latents]
+
+    def _check_prompt(self, prompt: object) -> None:
+        if not isinstance(prompt, str):
+            raise ValueError(f"a prompt must be a string, like 'a person walks', and {type(prompt).__name__} came")
+        if not prompt.strip():
+            raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
+        try:
+            prompt.encode("utf-8")
+        except UnicodeEncodeError as error:
+            raise ValueError("the prompt holds bytes that are no text in this locale's encoding") from error
+        encoding = self.text.tokenizer.encode(prompt)
+        if encoding.overflowing:
+            total = len(encoding.ids) + sum(len(rest.ids) for rest in encoding.overflowing)
+            raise ValueError(
+                f"the prompt is too long: about {total} word pieces, and the longest is {len(encoding.ids)}"
+            )
+
+
+def _as_list(value: object, name: str, expected: str) -> list:
+    if not isinstance(value, (list, tuple)) or not value:
+        what = "an empty list" if isinstance(value, (list, tuple)) else type(value).__name__
+        raise ValueError(f"{name} must be {expected}, and {what} came")
+    return list(value)
+
+
+def _spread(value: object, count: int, name: str) -> list:
+    """One value for all prompts, or a list with one for each."""
+    if not isinstance(value, (list, tuple, np.ndarray)):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"{name}: {count} prompts need one value or {count}, and {len(value)} came")
+    return list(value)
+
+
+def _integer(value: object, name: str, low: int, high: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        raise ValueError(f"{name} must be a whole number from {low} to {high}, and {value!r} came")
+    return int(value)
+
+
+def _check_frames(value: object) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not MIN_FRAMES <= value <= MAX_FRAMES:
+        raise ValueError(
+            f"num_frames must be a whole number from {MIN_FRAMES} (0.2 s) to {MAX_FRAMES} (9.8 s, the longest), "
+            f"and {value!r} came"
+        )
+    return int(value)
+
+
+def _check_guidance(value: object) -> float:
+    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not number or not math.isfinite(value) or not 0 <= value <= MAX_GUIDANCE:
+        raise ValueError(f"guidance_scale must be a number from 0 to {MAX_GUIDANCE:.0f} (1 is off), and {value!r} came")
+    return float(value)

@@ -1,0 +1,174 @@
+"""What a batch is made of: crops of features for the VAE; latents and the words that each of them sees for the DiT.
+
+A motion of several segments can be described in two ways. The whole-clip caption ("a person walks, then waves") is seen
+by every latent. Or each latent sees only the sentence of its own segment ("a person walks" | "a person waves"): this is
+how a prompt that changes over time will arrive later (CMDM B.1). Crops that start in the middle of a motion teach the
+model that a motion need not begin at rest with its first sentence.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from minicmdm.models.text import Words
+from minicmdm.models.vae import MACVAE
+
+if TYPE_CHECKING:
+    from minicmdm.data.dataset import Clip, MotionDataset
+
+WHOLE, SEGMENTS, CROPPED = 0, 1, 2  # the three ways to show a clip
+SHARES = (0.6, 0.2, 0.2)  # how often each is drawn
+SHORTEST_CROP = 4  # latents
+POOL = 8  # batches are cut from a pool of this many batches, sorted by length, so that little is padding
+
+
+def crop_features(data: MotionDataset, count: int, frames: int, generator: torch.Generator) -> Tensor:
+    """Draw `count` normalised crops of one length (B,T,D): `frames` long or, for a share of the batches, as long as
+    the shortest clips, so that clips shorter than a crop are learnt too."""
+    lengths = np.array([len(clip.features) for clip in data.clips])
+    group = lengths >= frames
+    if torch.rand((), generator=generator).item() >= group.mean():  # a batch of the short ones
+        group = ~group
+        frames = int(lengths[group].min()) // 4 * 4
+    members = np.flatnonzero(group)
+    chosen = members[torch.randint(len(members), (count,), generator=generator).numpy()]
+    starts = torch.rand(count, generator=generator).numpy() * (lengths[chosen] - frames + 1)
+    crops = np.stack([data.clips[i].features[int(s) : int(s) + frames] for i, s in zip(chosen, starts)])
+    return torch.from_numpy((crops - data.mean) / data.std).float()
+
+
+def latent_owners(clip: Clip, num_latents: int) -> np.ndarray:
+    """Which of the clip's labels each latent (four frames) belongs to: the last one begun by its middle frame. (N,)"""
+    begins = np.array([start for start, _, _ in clip.labels])
+    middle = 4 * np.arange(num_latents) + 2
+    return np.clip(np.searchsorted(begins, middle, side="right") - 1, 0, None)
+
+
+@dataclass
+class LatentSet:
+    """Every clip of a dataset as a Gaussian per latent, normalised to mean 0 and std 1 per channel."""
+
+    means: list[Tensor]  # one (N,C) per clip
+    stds: list[Tensor]  # one (N,C) per clip
+    captions: list[list[str]]
+    sentences: list[list[str]]  # per clip, one sentence per label; empty if it has no labels
+    owners: list[Tensor]  # one (N,) per clip: the label of each latent
+    shift: Tensor  # (C,) the measured mean and std of raw latents
+    scale: Tensor
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+
+@torch.no_grad()
+def encode_dataset(vae: MACVAE, data: MotionDataset, stats: tuple[Tensor, Tensor] | None = None) -> LatentSet:
+    """Encode every clip once (the last one to three frames of an odd length are dropped).
+
+    `stats` (shift, scale) are those of the training set; without them they are measured here, on sampled latents:
+    the variance of a sample is the variance of the means plus the mean of the posterior variances.
+    """
+    means: list = [None] * len(data.clips)
+    stds: list = [None] * len(data.clips)
+    order = sorted(range(len(data.clips)), key=lambda i: len(data.clips[i].features))
+    for first in range(0, len(order), 64):
+        chosen = order[first : first + 64]
+        counts = [len(data.clips[i].features) // 4 for i in chosen]
+        batch = np.zeros((len(chosen), 4 * max(counts), data.mean.shape[0]), np.float32)
+        for row, i, n in zip(batch, chosen, counts):  # zeros after the end: a causal encoder never looks there
+            row[: 4 * n] = (data.clips[i].features[: 4 * n] - data.mean) / data.std
+        mean, logvar = vae.encode(torch.from_numpy(batch))  # (B,N,C) each
+        for i, n, m, s in zip(chosen, counts, mean, (0.5 * logvar).exp()):
+            means[i], stds[i] = m[:n].clone(), s[:n].clone()
+    if stats is None:
+        every_mean, every_std = torch.cat(means), torch.cat(stds)  # (all latents, C)
+        variance = every_mean.var(0) + every_std.square().mean(0)
+        stats = every_mean.mean(0), variance.sqrt().clamp_min(1e-3)
+    shift, scale = stats
+    return LatentSet(
+        means=[(m - shift) / scale for m in means],
+        stds=[s / scale for s in stds],
+        captions=[clip.captions for clip in data.clips],
+        sentences=[[sentence for _, _, sentence in clip.labels] for clip in data.clips],
+        owners=[
+            torch.from_numpy(latent_owners(clip, len(m))) if clip.labels else torch.zeros(len(m), dtype=torch.long)
+            for clip, m in zip(data.clips, means)
+        ],
+        shift=shift,
+        scale=scale,
+    )
+
+
+@dataclass
+class DenoiserBatch:
+    """Latents, and which sentence each of them sees. R is the most sentences of any sample in the batch."""
+
+    z: Tensor  # (B,N,C) normalised, zero where not valid
+    valid: Tensor  # (B,N) bool
+    sentences: list[str]  # every different sentence of the batch, once
+    choice: Tensor  # (B,R) index into `sentences`; -1 where a sample has fewer than R
+    owner: Tensor  # (B,N) which of its sample's R sentences a latent sees
+
+
+def draw_batch(
+    latents: LatentSet, count: int, text_drop: float, generator: torch.Generator, shares=SHARES
+) -> DenoiserBatch:
+    """Draw a batch: clips of like length, sampled latents, sentences by one of the three ways, some text dropped."""
+    pool = torch.randint(len(latents), (POOL * count,), generator=generator).tolist()
+    pool.sort(key=lambda i: len(latents.means[i]))
+    slot = int(torch.randint(POOL, (), generator=generator))
+    chosen = pool[slot * count : (slot + 1) * count]  # every clip of the pool is as likely as any other
+    ways = torch.multinomial(torch.tensor(shares), count, replacement=True, generator=generator).tolist()
+    luck = torch.rand(count, 3, generator=generator).tolist()
+    table: dict[str, int] = {}  # sentence -> its place in the batch's list
+    samples = []
+    for i, way, (where, which, dropped) in zip(chosen, ways, luck):
+        total = len(latents.means[i])
+        begin, owner, sentences = 0, latents.owners[i], latents.sentences[i]
+        if not sentences or way == WHOLE:  # a clip without labels has its caption only
+            captions = latents.captions[i]
+            sentences, owner = [captions[int(which * len(captions))]], torch.zeros_like(owner)
+        elif way == CROPPED and total > SHORTEST_CROP:
+            begin = 1 + int(where * (total - SHORTEST_CROP))  # 1 .. total - SHORTEST_CROP
+        if dropped < text_drop:
+            sentences, owner = [""], torch.zeros_like(owner)
+        places = [table.setdefault(sentence, len(table)) for sentence in sentences]
+        samples.append((i, begin, places, owner[begin:]))
+
+    longest = max(len(owner) for _, _, _, owner in samples)
+    most = max(len(places) for _, _, places, _ in samples)
+    channels = latents.shift.shape[0]
+    mean, std = torch.zeros(count, longest, channels), torch.zeros(count, longest, channels)
+    valid = torch.zeros(count, longest, dtype=torch.bool)
+    choice = torch.full((count, most), -1)
+    owners = torch.zeros(count, longest, dtype=torch.long)
+    for row, (i, begin, places, owner) in enumerate(samples):
+        n = len(owner)
+        mean[row, :n], std[row, :n] = latents.means[i][begin:], latents.stds[i][begin:]
+        valid[row, :n] = True
+        choice[row, : len(places)] = torch.tensor(places)
+        owners[row, :n] = owner
+    z = mean + std * torch.randn(mean.shape, generator=generator)  # a posterior sample; std is 0 in the padding
+    return DenoiserBatch(z, valid, list(table), choice, owners)
+
+
+def words_per_latent(words: Words, choice: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
+    """Lay each sample's sentences side by side and let each latent see the words of its own sentence.
+
+    `words` are the batch's different sentences, encoded one by one: embeddings (U,S1,E), mask (U,S1). Returns words
+    (B,S,E) and mask (B,N,S), where S counts the real words of the sample that has most.
+    """
+    length, width = words.embeddings.shape[1:]
+    rows = choice.clamp(min=0)  # (B,R)
+    real = (words.mask[rows] & (choice >= 0)[..., None]).flatten(1)  # (B,R,S1) -> (B,R*S1)
+    most = int(real.sum(1).max())
+    order = real.int().argsort(dim=1, descending=True, stable=True)[:, :most]  # (B,S): real words first, in order
+    flat = words.embeddings[rows].flatten(1, 2)  # (B,R,S1,E) -> (B,R*S1,E)
+    side_by_side = flat.gather(1, order[..., None].expand(-1, -1, width))  # (B,S,E)
+    sentence = order // length  # (B,S): which of its sample's sentences a word belongs to
+    mask = real.gather(1, order)[:, None, :] & (sentence[:, None, :] == owner[:, :, None])  # (B,N,S)
+    return side_by_side, mask

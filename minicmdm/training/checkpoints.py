@@ -1,0 +1,193 @@
+"""Checkpoints: safetensors for the numbers, one JSON card for the words. Nothing is ever unpickled.
+
+A checkpoint is a folder:
+
+    vae.safetensors     MAC-VAE (EMA weights)
+    dit.safetensors     CausalDiT (EMA weights)
+    text/               the text encoder: tokenizer.json, config.json, model.safetensors
+    stats.safetensors   mean and std of the features (263,), and of the latents (C,)
+    card.json           preset, seed, data fingerprint, metrics, seconds, version, command, and the files' checksums
+
+The card is written last and names the checksum of every weight file, so a folder whose parts do not belong together
+(killed between two files, or mixed by hand) is recognised and refused instead of sampled.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from minicmdm.config import Preset
+from minicmdm.files import whole_file, write_text
+from minicmdm.models.dit import CausalDiT
+from minicmdm.models.text import TextEncoder
+from minicmdm.models.vae import MACVAE
+
+FORMAT = "minicmdm-checkpoint-1"
+WEIGHTS = ("vae.safetensors", "stats.safetensors", "dit.safetensors", "text/model.safetensors")
+STATS = ("feature_mean", "feature_std", "latent_mean", "latent_std")
+
+
+@dataclass
+class Checkpoint:
+    """A loaded checkpoint: models in eval mode, and the statistics (float32) that go with them."""
+
+    preset: Preset
+    vae: MACVAE
+    dit: CausalDiT
+    text: TextEncoder
+    stats: dict[str, Tensor]  # feature_mean, feature_std (D,); latent_mean, latent_std (C,)
+    card: dict
+
+
+def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], note: object = None) -> None:
+    """Write tensors, and a JSON-able note in the same file's header, as one whole file."""
+    ready = {key: value.detach().cpu().contiguous().clone() for key, value in tensors.items()}
+    with whole_file(path) as temporary:
+        temporary.write_bytes(safetensors.torch.save(ready, metadata={"note": json.dumps(note)}))
+
+
+def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], object]:
+    """Read a safetensors file; return its tensors and its note (None if it has none).
+
+    Raises FileNotFoundError if it is missing, ValueError if it is cut short, empty or no safetensors file at all.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}: a weight file in safetensors format was expected there")
+    try:
+        raw = path.read_bytes()  # read, not mapped: the file may be replaced while we still use the numbers
+        tensors = safetensors.torch.load(raw)
+        header = json.loads(raw[8 : 8 + int.from_bytes(raw[:8], "little")])
+        note = json.loads(header.get("__metadata__", {}).get("note", "null"))
+    except (SafetensorError, ValueError, KeyError) as error:
+        size = path.stat().st_size
+        raise ValueError(
+            f"{path} ({size} bytes) is not a whole safetensors file: it is cut short or of another kind ({error})"
+        ) from error
+    return tensors, note
+
+
+def load_weights(module: nn.Module, path: str | Path) -> None:
+    """Load a weight file into a module whose names and shapes must match exactly; teach the first difference."""
+    tensors, _ = load_tensors(path)
+    own = module.state_dict()
+    for key in own.keys() | tensors.keys():
+        if key not in tensors or key not in own:
+            where = "the file lacks" if key not in tensors else "the file has a foreign"
+            raise ValueError(
+                f"{path} does not fit the model {type(module).__name__} of its card: {where} tensor {key!r}"
+            )
+        if own[key].shape != tensors[key].shape:
+            shapes = f"{tuple(own[key].shape)} expected, {tuple(tensors[key].shape)} found"
+            raise ValueError(f"{path} does not fit the model {type(module).__name__} of its card: {key!r} is {shapes}")
+        if not torch.isfinite(tensors[key]).all():
+            raise ValueError(f"{path}: the tensor {key!r} holds numbers that are not finite")
+    module.load_state_dict(tensors)
+
+
+def checksum(path: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def save_vae(folder: Path, vae: MACVAE, stats: Mapping[str, Tensor]) -> None:
+    """Write the first stage's part: the VAE and the statistics."""
+    save_tensors(folder / "vae.safetensors", vae.state_dict())
+    save_tensors(folder / "stats.safetensors", stats)
+
+
+def save_denoiser(folder: Path, dit: CausalDiT, text: TextEncoder) -> None:
+    """Write the second stage's part: the DiT and the text encoder."""
+    save_tensors(folder / "dit.safetensors", dit.state_dict())
+    save_text(folder, text)
+
+
+def save_text(folder: Path, text: TextEncoder) -> None:
+    """Write the text encoder into `folder`/text: made elsewhere first, then moved in file by file, each whole."""
+    (folder / "text").mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as elsewhere:
+        text.save(Path(elsewhere))
+        for file in sorted(Path(elsewhere).iterdir()):
+            with whole_file(folder / "text" / file.name) as temporary:
+                temporary.write_bytes(file.read_bytes())
+
+
+def write_card(folder: Path, preset: Preset, facts: Mapping[str, object]) -> None:
+    """Write the card last: what the weights are, how they were made, and the checksum of every weight file."""
+    files = {name: checksum(folder / name) for name in WEIGHTS if (folder / name).is_file()}
+    card = {"format": FORMAT, "preset": preset.to_dict(), **facts, "files": files}
+    write_text(folder / "card.json", json.dumps(card, indent=2) + "\n")
+
+
+def read_card(folder: str | Path) -> dict:
+    """Read and verify a checkpoint's card and the checksums it names (FileNotFoundError, ValueError)."""
+    folder = Path(folder)
+    path = folder / "card.json"
+    if not folder.exists():
+        raise FileNotFoundError(f'no checkpoint folder {folder}: give "toy" or a folder made by `minicmdm train --out`')
+    if not path.is_file():
+        hint = (
+            "its training has not ended, go on with `minicmdm train --resume`"
+            if any(folder.glob("state_*.safetensors"))
+            else "a checkpoint folder holds card.json beside its weights"
+        )
+        raise FileNotFoundError(f"{folder} holds no finished checkpoint (no card.json): {hint}")
+    try:
+        card = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is not a whole JSON file: {error}") from error
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        found = card.get("format") if isinstance(card, dict) else type(card).__name__
+        raise ValueError(
+            f"{path} is not the card of a minicmdm checkpoint: format {FORMAT!r} expected, {found!r} found"
+        )
+    for name, expected in card["files"].items():
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"the checkpoint {folder} lacks {name}, which its card names")
+        if checksum(folder / name) != expected:
+            load_tensors(folder / name)  # a cut file says so itself; a whole one is simply not the card's
+            raise ValueError(f"{folder / name} is not the file that the card describes: it was changed or mixed in")
+    return card
+
+
+def load_checkpoint(folder: str | Path) -> Checkpoint:
+    """Load a whole checkpoint folder (FileNotFoundError or ValueError, with what was expected and what is there)."""
+    folder = Path(folder)
+    card = read_card(folder)
+    if "dit.safetensors" not in card["files"]:
+        raise ValueError(f"{folder} holds a VAE only: train the rest with `minicmdm train --stage dit --out {folder}`")
+    preset = read_preset(card, folder)
+    vae, stats = load_vae(folder, preset)
+    dit = CausalDiT(preset.dit)
+    load_weights(dit, folder / "dit.safetensors")
+    text = TextEncoder.load(folder / "text", preset.text)
+    return Checkpoint(preset, vae, dit.eval(), text.eval(), stats, card)
+
+
+def load_vae(folder: Path, preset: Preset) -> tuple[MACVAE, dict[str, Tensor]]:
+    """Load the first stage's part: the VAE in eval mode and the statistics."""
+    vae = MACVAE(preset.vae)
+    load_weights(vae, folder / "vae.safetensors")
+    stats, _ = load_tensors(folder / "stats.safetensors")
+    for name in STATS:
+        if name not in stats or not torch.isfinite(stats[name]).all():
+            raise ValueError(f"{folder / 'stats.safetensors'} must hold finite {', '.join(STATS)}; {name} fails")
+    return vae.eval(), stats
+
+
+def read_preset(card: dict, folder: Path) -> Preset:
+    """The preset that a card describes (ValueError if its fields are not those of this version)."""
+    try:
+        return Preset.from_dict(card["preset"])
+    except (TypeError, KeyError, ValueError) as error:
+        raise ValueError(f"{folder / 'card.json'} describes no preset that this version knows: {error}") from error
