@@ -159,7 +159,8 @@ function minicmdmPlayer(root, data) {
     const bones = [];
     for (let j = 1; j < 22; j++) bones.push([data.parents[j], j]);
     // A shadow straight below shows at once what floats or sinks.
-    lines(context, bones.map(([p, j]) => [shadow(p), shadow(j)]), "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
+    const below = bones.map(([p, j]) => [shadow(p), shadow(j)]);
+    lines(context, below, "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
     bones.sort((a, b) => at(b[0]).away + at(b[1]).away - at(a[0]).away - at(a[1]).away); // far ones first
     for (const [p, j] of bones) lines(context, [[at(p), at(j)]], COLOURS[data.sides[j]], 0.038 * at(j).size);
     const head = at(15);

@@ -15,9 +15,7 @@ import numpy as np
 
 from minicmdm.data.skeleton import FPS, LEFT_JOINTS, NUM_JOINTS, PARENTS, RIGHT_JOINTS
 
-SIDES = [
-    "left" if j in LEFT_JOINTS else "right" if j in RIGHT_JOINTS else "middle" for j in range(NUM_JOINTS)
-]
+SIDES = ["left" if j in LEFT_JOINTS else "right" if j in RIGHT_JOINTS else "middle" for j in range(NUM_JOINTS)]
 
 _PAGE = """<!doctype html>
 <html lang="en">
@@ -54,9 +52,7 @@ def player_data(joints_list: list[np.ndarray], captions: list[str], fps: float =
     """
     joints_list = [np.asarray(joints, dtype=np.float64) for joints in joints_list]
     if not joints_list or len(joints_list) != len(captions):
-        raise ValueError(
-            f"expected one caption per motion, got {len(joints_list)} motions, {len(captions)} captions"
-        )
+        raise ValueError(f"expected one caption per motion, got {len(joints_list)} motions, {len(captions)} captions")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps must be a positive number of frames per second, got {fps}")
     clips = []
