@@ -47,7 +47,7 @@ class Block(nn.Module):
 
     def __init__(self, dim: int, heads: int, feedforward_dim: int):
         super().__init__()
-        self.modulation = nn.Sequential(nn.SiLU(), nn.Linear(dim, 6 * dim))
+        self.modulation = nn.Linear(dim, 6 * dim)
         self.norm1 = nn.LayerNorm(dim, elementwise_affine=False)
         self.self_attention = Attention(dim, heads)
         self.norm2 = nn.LayerNorm(dim)
@@ -56,8 +56,8 @@ class Block(nn.Module):
         self.feedforward = nn.Sequential(
             nn.Linear(dim, feedforward_dim), nn.GELU(approximate="tanh"), nn.Linear(feedforward_dim, dim)
         )
-        nn.init.zeros_(self.modulation[1].weight)
-        nn.init.zeros_(self.modulation[1].bias)
+        nn.init.zeros_(self.modulation.weight)
+        nn.init.zeros_(self.modulation.bias)
 
     def forward(
         self, x: Tensor, time: Tensor, mask: Tensor, positions: Tensor, words: Tensor, word_mask: Tensor
@@ -81,17 +81,16 @@ class CausalDiT(nn.Module):
         self.cfg = cfg
         self.embed_latent = nn.Linear(cfg.latent_dim, cfg.dim)
         self.embed_words = nn.Linear(cfg.text_dim, cfg.dim)
+        # AdaLN is SiLU and linear in every block; the SiLU is the same for all of them, so it is done here, once.
         self.embed_time = nn.Sequential(
-            nn.Linear(cfg.time_dim, cfg.dim), nn.SiLU(), nn.Linear(cfg.dim, cfg.dim)
+            nn.Linear(cfg.time_dim, cfg.dim), nn.SiLU(), nn.Linear(cfg.dim, cfg.dim), nn.SiLU()
         )
         self.blocks = nn.ModuleList(Block(cfg.dim, cfg.heads, cfg.feedforward_dim) for _ in range(cfg.layers))
         self.out = nn.Linear(cfg.dim, cfg.latent_dim)  # plain, as released: no last norm, no last AdaLN
         nn.init.zeros_(self.out.weight)
         nn.init.zeros_(self.out.bias)
 
-    def forward(
-        self, z_t: Tensor, t: Tensor, words: Tensor, word_mask: Tensor, valid: Tensor | None = None
-    ) -> Tensor:
+    def forward(self, z_t: Tensor, t: Tensor, words: Tensor, word_mask: Tensor, valid: Tensor | None = None) -> Tensor:
         """Predict the velocity of every latent.
 
         z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,E) with word_mask (B,N,S), True where latent n

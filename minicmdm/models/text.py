@@ -48,7 +48,7 @@ class TextEncoder(nn.Module):
         self.cfg = cfg
         self.tokenizer = tokenizer
         self.config = config  # DistilBertConfig's arguments
-        self.bert = DistilBertModel(DistilBertConfig(**config, attn_implementation="sdpa"))
+        self.bert = DistilBertModel(DistilBertConfig(**config, attn_implementation="eager"))
         limit = min(cfg.max_words, config["max_position_embeddings"])
         self.tokenizer.enable_truncation(limit)
         self.tokenizer.enable_padding(pad_id=self.tokenizer.token_to_id("[PAD]"), pad_token="[PAD]")
@@ -132,9 +132,7 @@ class TextEncoder(nn.Module):
         try:
             encoder.bert.load_state_dict(weights)
         except RuntimeError as error:
-            raise ValueError(
-                f"{folder / 'model.safetensors'} does not fit its config.json: {error}"
-            ) from error
+            raise ValueError(f"{folder / 'model.safetensors'} does not fit its config.json: {error}") from error
         return encoder
 
     def save(self, folder: str | Path) -> None:
@@ -143,9 +141,7 @@ class TextEncoder(nn.Module):
         self.tokenizer.save(str(folder / "tokenizer.json"))
         config = {"model_type": "distilbert", **self.config, "minicmdm": asdict(self.cfg)}
         (folder / "config.json").write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-        save_file(
-            {k: v.contiguous() for k, v in self.bert.state_dict().items()}, folder / "model.safetensors"
-        )
+        save_file({k: v.contiguous() for k, v in self.bert.state_dict().items()}, folder / "model.safetensors")
 
     def train(self, mode: bool = True) -> "TextEncoder":
         return super().train(mode and not self.cfg.frozen)

@@ -81,9 +81,7 @@ class MACVAE(nn.Module):
     def decode(self, z: Tensor) -> Tensor:
         """Latents (B,N,C) -> normalised features (B,T,D), T = N * 2**down."""
         if z.ndim != 3 or z.shape[-1] != self.cfg.latent_dim or z.shape[1] == 0:
-            raise ValueError(
-                f"the VAE decodes (batch, latents >= 1, {self.cfg.latent_dim}), got {tuple(z.shape)}"
-            )
+            raise ValueError(f"the VAE decodes (batch, latents >= 1, {self.cfg.latent_dim}), got {tuple(z.shape)}")
         return self.decoder(self.from_latent(z).transpose(1, 2)).transpose(1, 2)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> VAEOutput:
