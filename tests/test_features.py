@@ -21,9 +21,7 @@ def smooth_motion(seed=0, frames=61, turning=0.0):
     """A body that sways every joint, wanders and may turn steadily: (frames, 22, 3)."""
     rng = np.random.default_rng(seed)
     t = np.arange(frames)[:, None, None] / sk.FPS
-    sway = 0.3 * np.sin(
-        2 * np.pi * rng.uniform(0.2, 1, (22, 3)) * t + rng.uniform(0, 6, (22, 3))
-    )  # (T, 22, 3) rad
+    sway = 0.3 * np.sin(2 * np.pi * rng.uniform(0.2, 1, (22, 3)) * t + rng.uniform(0, 6, (22, 3)))  # (T, 22, 3) rad
     angle = np.linalg.norm(sway, axis=-1)
     local = sk.quat_from_axis_angle(sway / angle[..., None], angle)
     local[:, 0] = sk.quat_multiply(sk.quat_yaw(turning * t[:, 0, 0] + rng.uniform(-3, 3)), local[:, 0])
@@ -146,9 +144,7 @@ def test_columns_hold_what_their_names_say():
     t = 17
     local = ft.turn(joints[t], -yaw[t])
     np.testing.assert_allclose(features[t, 3], joints[t, 0, 1])
-    np.testing.assert_allclose(
-        features[t, ft.POSITIONS].reshape(21, 3), local[1:] - local[0] * [1, 0, 1], atol=1e-12
-    )
+    np.testing.assert_allclose(features[t, ft.POSITIONS].reshape(21, 3), local[1:] - local[0] * [1, 0, 1], atol=1e-12)
     step = ft.turn(joints[t + 1, 0] - joints[t, 0], -yaw[t + 1])  # the next heading
     np.testing.assert_allclose(features[t, ft.ROOT_LINEAR], step[[0, 2]], atol=1e-12)
     velocity = ft.turn(joints[t + 1] - joints[t], -yaw[t])  # this heading
@@ -170,9 +166,7 @@ def test_6d_block_rebuilds_every_bone():
 
 
 def test_contacts_mark_slow_feet_in_the_released_order():
-    joints = np.repeat(
-        sk.forward_kinematics(np.tile([1.0, 0, 0, 0], (1, 22, 1)), np.zeros((1, 3))), 5, axis=0
-    )
+    joints = np.repeat(sk.forward_kinematics(np.tile([1.0, 0, 0, 0], (1, 22, 1)), np.zeros((1, 3))), 5, axis=0)
     joints[:, 10, 0] += 0.0446 * np.arange(5)  # left foot just slow enough
     joints[:, 8, 0] += 0.0448 * np.arange(5)  # right ankle just too fast
     assert np.array_equal(ft.joints_to_features(joints)[:, ft.CONTACTS], np.tile([1, 1, 0, 1], (4, 1)))
@@ -195,9 +189,7 @@ def test_retarget_sets_lengths_keeps_directions_and_scales_the_path():
     small = ft.retarget(joints, sk.BONE_LENGTHS * np.linspace(0.5, 0.8, 22))
     back = ft.retarget(small)
     bones = back[:, 1:] - back[:, list(sk.PARENTS[1:])]
-    np.testing.assert_allclose(
-        np.linalg.norm(bones, axis=-1), np.tile(sk.BONE_LENGTHS[1:], (61, 1)), atol=1e-12
-    )
+    np.testing.assert_allclose(np.linalg.norm(bones, axis=-1), np.tile(sk.BONE_LENGTHS[1:], (61, 1)), atol=1e-12)
     np.testing.assert_allclose(back, joints, atol=1e-9)  # same directions, and the path scaled there and back
     legs = small[:, [5, 8]] - small[:, [2, 5]]
     ratio = np.linalg.norm(legs[0], axis=-1).sum() / sk.BONE_LENGTHS[[5, 8]].sum()

@@ -219,9 +219,7 @@ def retarget(joints: np.ndarray, lengths: np.ndarray = BONE_LENGTHS) -> np.ndarr
     source = np.linalg.norm(bones, axis=-1)
     if (source[:, 1:] == 0).any():
         frame, joint = np.argwhere(source[:, 1:] == 0)[0] + [0, 1]
-        raise ValueError(
-            f"{JOINT_NAMES[joint]} lies on its parent in frame {frame}: the bone has no direction"
-        )
+        raise ValueError(f"{JOINT_NAMES[joint]} lies on its parent in frame {frame}: the bone has no direction")
     legs = (5, 8)  # the right thigh and shin of frame 0 say how tall the body is
     result = np.empty_like(joints)
     result[:, 0] = joints[:, 0] * (lengths[list(legs)].sum() / source[0, legs].sum())
@@ -263,13 +261,9 @@ def _checked_joints(joints: np.ndarray, min_frames: int = 1) -> tuple[np.ndarray
     if joints.ndim != 3 or joints.shape[1:] != (NUM_JOINTS, 3):
         raise ValueError(f"joints must have shape (frames, {NUM_JOINTS}, 3) in metres, got {joints.shape}")
     if len(joints) < min_frames:
-        raise ValueError(
-            f"joints need at least {min_frames} frames (a step needs a next frame), got {len(joints)}"
-        )
+        raise ValueError(f"joints need at least {min_frames} frames (a step needs a next frame), got {len(joints)}")
     joints = joints.astype(np.float64)
     if not np.isfinite(joints).all():
         frame, joint, _ = np.argwhere(~np.isfinite(joints))[0]
-        raise ValueError(
-            f"joints must be finite, but {JOINT_NAMES[joint]} is {joints[frame, joint]} in frame {frame}"
-        )
+        raise ValueError(f"joints must be finite, but {JOINT_NAMES[joint]} is {joints[frame, joint]} in frame {frame}")
     return joints, dtype

@@ -165,9 +165,7 @@ def sixd_to_matrix(sixd: np.ndarray) -> np.ndarray:
     return np.stack([first, second, cross(first, second)], axis=-1)
 
 
-def forward_kinematics(
-    local_rotations: np.ndarray, root: np.ndarray, offsets: np.ndarray = REST_OFFSETS
-) -> np.ndarray:
+def forward_kinematics(local_rotations: np.ndarray, root: np.ndarray, offsets: np.ndarray = REST_OFFSETS) -> np.ndarray:
     """Joint positions (..., 22, 3) from joint rotations (..., 22, 4), root (..., 3) and rest bones (22, 3).
 
     The usual convention (SMPL, BVH): the rotation of joint j is relative to its parent's and turns all that
@@ -175,9 +173,7 @@ def forward_kinematics(
     """
     local_rotations = np.asarray(local_rotations, dtype=float)
     if local_rotations.shape[-2:] != (NUM_JOINTS, 4):
-        raise ValueError(
-            f"local_rotations must be (..., 22, 4) quaternions, got shape {local_rotations.shape}"
-        )
+        raise ValueError(f"local_rotations must be (..., 22, 4) quaternions, got shape {local_rotations.shape}")
     world = local_rotations.copy()  # (..., 22, 4); row 0 is already in the world
     joints = np.empty((*local_rotations.shape[:-1], 3))
     joints[..., 0, :] = root
