@@ -61,6 +61,14 @@ def _one_line(error: BaseException) -> str:
     return " ".join(text.split())
 
 
+def _as_typed(argument: str) -> str:
+    """A sentence as UTF-8, even where the locale (LC_ALL=C) knows ASCII only and handed us escaped bytes."""
+    try:
+        return os.fsencode(argument).decode("utf-8")
+    except UnicodeError:
+        return argument
+
+
 def _parser() -> Parser:
     import minicmdm
 
@@ -104,7 +112,7 @@ def _parser() -> Parser:
     actions = data.add_subparsers(metavar="ACTION", required=True, dest="action")
     sub = command("make", data_make, "Write the synthesised toy world as a folder in HumanML3D's layout.", actions)
     sub.add_argument("--out", required=True, help="folder to make")
-    sub.add_argument("--force", action="store_true", help="write into a folder that holds something already")
+    sub.add_argument("--force", action="store_true", help="replace a data set that is there already")
 
     sub = command("train", train, "Train a preset from nothing: the VAE, then the denoiser.")
     sub.add_argument("--preset", default="toy", help="toy, S, M, L or XL (default toy)")
@@ -133,14 +141,15 @@ def generate(arguments: argparse.Namespace) -> None:
     from minicmdm.files import check_output
     from minicmdm.motion import ENDINGS
 
-    if not arguments.prompt.strip():
+    prompt = _as_typed(arguments.prompt)
+    if not prompt.strip():
         raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
     out = check_output(arguments.out, ENDINGS, arguments.force)
     from minicmdm.pipeline import MotionPipeline  # loads torch
 
     pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
     motion = pipe(
-        arguments.prompt,
+        prompt,
         num_frames=arguments.frames,
         schedule=arguments.schedule,
         num_steps=arguments.steps,
@@ -200,11 +209,14 @@ def data_make(arguments: argparse.Namespace) -> None:
         raise FileExistsError(f"--out must be a folder to make, and {arguments.out or 'nothing'} is a file or empty")
     if not out.absolute().parent.is_dir():
         raise FileNotFoundError(f"the folder {out.absolute().parent} for {out.name} does not exist: make it first")
-    if out.is_dir() and any(out.iterdir()) and not arguments.force:
-        raise FileExistsError(f"the folder {out} is not empty and was left as it is: --force writes into it")
+    filled = out.is_dir() and any(out.iterdir())
+    if filled and not arguments.force:
+        raise FileExistsError(f"the folder {out} is not empty and was left as it is: --force replaces a data set")
+    if filled and not (out / "programs.jsonl").is_file():  # --force deletes: only ever a data set of ours
+        raise FileExistsError(f"the folder {out} holds something else than toy data and was left as it is")
     from minicmdm.data.dataset import make_folder
 
-    make_folder(out, force=arguments.force)
+    make_folder(out, force=out.is_dir())
     _say(f"wrote {out}")
 
 

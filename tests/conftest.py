@@ -6,39 +6,19 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["HF_HUB_OFFLINE"] = "1"
 
-from dataclasses import dataclass, replace  # noqa: E402
+from dataclasses import replace  # noqa: E402
 
 import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
 
 from minicmdm.config import DiTConfig, Preset, TextConfig, TrainConfig, VAEConfig  # noqa: E402
+from minicmdm.data.dataset import Clip, MotionDataset  # noqa: E402
 
 torch.set_num_threads(1)
 
 
-@dataclass
-class FakeClip:
-    """The fields of data.dataset.Clip that training reads."""
-
-    name: str
-    features: np.ndarray
-    captions: list
-    labels: list
-    program: object = None
-
-
-@dataclass
-class FakeData:
-    """The fields of data.dataset.MotionDataset that training reads."""
-
-    clips: list
-    mean: np.ndarray
-    std: np.ndarray
-    fingerprint: str = "fake"
-
-
-def make_fake_data(count: int = 12, seed: int = 0) -> FakeData:
+def make_fake_data(count: int = 12, seed: int = 0) -> MotionDataset:
     """Smooth waves instead of motion: lengths 40 to 100, one to three labelled segments each."""
     rng = np.random.default_rng(seed)
     verbs = ["walks", "runs", "waves the left hand", "jumps twice", "sits down"]
@@ -51,9 +31,9 @@ def make_fake_data(count: int = 12, seed: int = 0) -> FakeData:
         cuts = [length * part // parts for part in range(parts + 1)]
         said = [f"a person {verbs[rng.integers(len(verbs))]}" for _ in range(parts)]
         labels = list(zip(cuts[:-1], cuts[1:], said))
-        clips.append(FakeClip(f"{number:06d}", features.astype(np.float32), [", then ".join(said)], labels))
+        clips.append(Clip(f"{number:06d}", features.astype(np.float32), [", then ".join(said)], labels))
     stacked = np.concatenate([clip.features for clip in clips])
-    return FakeData(clips, stacked.mean(0), stacked.std(0) + 1e-3)
+    return MotionDataset(clips, stacked.mean(0), stacked.std(0) + 1e-3, "fake")
 
 
 def make_tiny_preset(**train) -> Preset:
@@ -70,7 +50,7 @@ def make_tiny_preset(**train) -> Preset:
 
 
 @pytest.fixture(scope="session")
-def fake_data() -> FakeData:
+def fake_data() -> MotionDataset:
     """Twelve clips that nobody may change."""
     return make_fake_data()
 
@@ -88,7 +68,7 @@ def tiny_run(tmp_path_factory, fake_data, tiny_preset):
     folder = tmp_path_factory.mktemp("run") / "tiny"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stages, "preset", lambda name: tiny_preset)
-        patch.setattr(stages, "_datasets", lambda data, fast: (fake_data, make_fake_data(4, seed=1)))
+        patch.setattr(stages, "_datasets", lambda *_: (fake_data, make_fake_data(4, seed=1)))
         stages.train("tiny", folder, progress=False)
     # As after much training, nothing is exactly zero: a zero output layer would hide what tests look for.
     return folder

@@ -9,17 +9,14 @@ model that a motion need not begin at rest with its first sentence.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from minicmdm.data.dataset import Clip, MotionDataset
 from minicmdm.models.text import Words
 from minicmdm.models.vae import MACVAE
-
-if TYPE_CHECKING:
-    from minicmdm.data.dataset import Clip, MotionDataset
 
 WHOLE, SEGMENTS, CROPPED = 0, 1, 2  # the three ways to show a clip
 SHARES = (0.6, 0.2, 0.2)  # how often each is drawn

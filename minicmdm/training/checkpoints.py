@@ -144,14 +144,17 @@ def read_card(folder: str | Path) -> dict:
         raise FileNotFoundError(f"{folder} holds no finished checkpoint (no card.json): {hint}")
     try:
         card = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not a whole JSON file: {error}") from error
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         found = card.get("format") if isinstance(card, dict) else type(card).__name__
         raise ValueError(
             f"{path} is not the card of a minicmdm checkpoint: format {FORMAT!r} expected, {found!r} found"
         )
-    for name, expected in card["files"].items():
+    files = card.get("files")
+    if not isinstance(files, dict) or not set(files) <= set(WEIGHTS):
+        raise ValueError(f"{path} must name the checksums of the files {', '.join(WEIGHTS)} under 'files'")
+    for name, expected in files.items():
         if not (folder / name).is_file():
             raise FileNotFoundError(f"the checkpoint {folder} lacks {name}, which its card names")
         if checksum(folder / name) != expected:
@@ -164,11 +167,14 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
     """Load a whole checkpoint folder (FileNotFoundError or ValueError, with what was expected and what is there)."""
     folder = Path(folder)
     card = read_card(folder)
-    if "dit.safetensors" not in card["files"]:
-        raise ValueError(f"{folder} holds a VAE only: train the rest with `minicmdm train --stage dit --out {folder}`")
+    if missing := [name for name in WEIGHTS if name not in card["files"]]:
+        raise ValueError(
+            f"{folder} holds a part of a checkpoint, without {', '.join(missing)}: "
+            f"`minicmdm train --stage dit --out {folder}` trains what follows the VAE"
+        )
     preset = read_preset(card, folder)
     vae, stats = load_vae(folder, preset)
-    dit = CausalDiT(preset.dit)
+    dit = _build(CausalDiT, preset.dit, folder)
     load_weights(dit, folder / "dit.safetensors")
     text = TextEncoder.load(folder / "text", preset.text)
     return Checkpoint(preset, vae, dit.eval(), text.eval(), stats, card)
@@ -176,18 +182,31 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
 
 def load_vae(folder: Path, preset: Preset) -> tuple[MACVAE, dict[str, Tensor]]:
     """Load the first stage's part: the VAE in eval mode and the statistics."""
-    vae = MACVAE(preset.vae)
+    vae = _build(MACVAE, preset.vae, folder)
     load_weights(vae, folder / "vae.safetensors")
     stats, _ = load_tensors(folder / "stats.safetensors")
     for name in STATS:
-        if name not in stats or not torch.isfinite(stats[name]).all():
-            raise ValueError(f"{folder / 'stats.safetensors'} must hold finite {', '.join(STATS)}; {name} fails")
+        size = preset.vae.input_dim if name.startswith("feature") else preset.vae.latent_dim
+        value = stats.get(name)
+        if value is None or value.shape != (size,) or not torch.isfinite(value).all():
+            raise ValueError(f"{folder / 'stats.safetensors'} must hold {name}: {size} finite numbers")
+        if name.endswith("std") and not (value > 0).all():
+            raise ValueError(f"{folder / 'stats.safetensors'}: {name} must be positive")
     return vae.eval(), stats
+
+
+def _build(model: type[nn.Module], config: object, folder: Path) -> nn.Module:
+    try:
+        return model(config)
+    except (TypeError, ValueError, RuntimeError, MemoryError) as error:
+        raise ValueError(
+            f"{folder / 'card.json'} describes a {model.__name__} that cannot be built: {error}"
+        ) from error
 
 
 def read_preset(card: dict, folder: Path) -> Preset:
     """The preset that a card describes (ValueError if its fields are not those of this version)."""
     try:
         return Preset.from_dict(card["preset"])
-    except (TypeError, KeyError, ValueError) as error:
+    except (TypeError, KeyError, ValueError, AttributeError) as error:
         raise ValueError(f"{folder / 'card.json'} describes no preset that this version knows: {error}") from error

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +20,7 @@ from torch import Tensor, nn
 
 import minicmdm
 from minicmdm.config import Preset, preset
+from minicmdm.data.dataset import MotionDataset, cached_toy_folder, load_dataset, toy_dataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.diffusion.forcing import diffusion_forcing_loss
 from minicmdm.models.dit import CausalDiT
@@ -29,9 +29,6 @@ from minicmdm.models.vae import MACVAE, vae_loss
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import LatentSet, crop_features, draw_batch, encode_dataset, words_per_latent
 from minicmdm.training.loop import LoopConfig, LoopResult, fit, step_key
-
-if TYPE_CHECKING:
-    from minicmdm.data.dataset import MotionDataset
 
 STAGES = ("vae", "dit", "all")
 Say = Callable[[str], None]
@@ -76,7 +73,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
 
     say("reading the data")
-    train_set, val_set = _datasets(data, fast)
+    train_set, val_set = _datasets(data, fast, progress)
     say(f"{len(train_set.clips)} clips to train on, {len(val_set.clips)} to validate on")
     facts = _old_facts(out)
     facts |= {
@@ -99,14 +96,11 @@ def train(
     return out
 
 
-def _datasets(data: str | Path | None, fast: bool) -> tuple[MotionDataset, MotionDataset]:
-    from minicmdm.data.dataset import load_dataset, toy_dataset
-
-    if data is not None:
-        return load_dataset(data, split="train"), load_dataset(data, split="val")
-    if fast:
+def _datasets(data: str | Path | None, fast: bool, progress: bool) -> tuple[MotionDataset, MotionDataset]:
+    if fast and data is None:
         return toy_dataset("train", count=48), toy_dataset("val", count=8)
-    return toy_dataset("train"), toy_dataset("val")
+    folder = cached_toy_folder(progress) if data is None else data
+    return load_dataset(folder, "train"), load_dataset(folder, "val")
 
 
 def _old_facts(out: Path) -> dict:
