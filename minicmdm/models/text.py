@@ -13,6 +13,8 @@ Nothing here can reach the network: a folder holds `tokenizer.json`, `config.jso
 """
 
 import json
+import string
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -58,23 +60,21 @@ class TextEncoder(nn.Module):
 
     @classmethod
     def from_captions(cls, captions: list[str], cfg: TextConfig) -> "TextEncoder":
-        """A new encoder with random weights and a WordPiece vocabulary learnt from the captions."""
-        from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors, trainers
+        """A new encoder with random weights and a WordPiece vocabulary made from the captions."""
+        from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
 
         if not captions:
-            raise ValueError("a vocabulary is learnt from captions, but the list is empty")
+            raise ValueError("a vocabulary is made from captions, but the list is empty")
         _check_sentences(captions)
-        tokenizer = Tokenizer(models.WordPiece(unk_token="[UNK]"))
-        tokenizer.normalizer = normalizers.BertNormalizer(lowercase=True)
-        tokenizer.pre_tokenizer = pre_tokenizers.BertPreTokenizer()
-        trainer = trainers.WordPieceTrainer(
-            vocab_size=cfg.vocab_size, special_tokens=list(SPECIAL), show_progress=False
-        )
-        tokenizer.train_from_iterator(captions, trainer)
+        normalizer, splitter = normalizers.BertNormalizer(lowercase=True), pre_tokenizers.BertPreTokenizer()
+        split = (splitter.pre_tokenize_str(normalizer.normalize_str(caption)) for caption in captions)
+        counts = Counter(word for caption in split for word, _ in caption)
+        tokenizer = Tokenizer(models.WordPiece(_vocabulary(counts, cfg.vocab_size), unk_token="[UNK]"))
+        tokenizer.normalizer, tokenizer.pre_tokenizer = normalizer, splitter
         tokenizer.post_processor = processors.TemplateProcessing(
-            single="[CLS] $A [SEP]",
-            special_tokens=[(word, SPECIAL.index(word)) for word in ("[CLS]", "[SEP]")],
+            single="[CLS] $A [SEP]", special_tokens=[(word, SPECIAL.index(word)) for word in ("[CLS]", "[SEP]")]
         )
+        tokenizer.add_special_tokens(list(SPECIAL))
         config = {
             "vocab_size": tokenizer.get_vocab_size(),
             "max_position_embeddings": cfg.max_words,
@@ -158,6 +158,20 @@ class TextEncoder(nn.Module):
         return Words(embeddings, mask.bool())
 
     forward = encode
+
+
+def _vocabulary(counts: Counter, size: int) -> dict[str, int]:
+    """Word pieces and their ids: special tokens, every letter (to spell any word), then the commonest words.
+
+    The library's WordPiece trainer breaks ties by hash order, so its vocabulary changes from run to run; this one
+    is the same wherever the captions are. Captions of one domain have few enough words to keep them whole.
+    """
+    letters = sorted(set(string.ascii_lowercase + string.digits).union(*counts))
+    words = sorted((word for word in counts if len(word) > 1), key=lambda word: (-counts[word], word))
+    pieces = [*SPECIAL, *letters, *(f"##{letter}" for letter in letters)]
+    if len(pieces) > size:
+        raise ValueError(f"vocab_size {size} cannot hold the {len(pieces)} special tokens and letters of the captions")
+    return {piece: number for number, piece in enumerate((pieces + words)[:size])}
 
 
 def _check_sentences(sentences) -> None:
