@@ -134,8 +134,7 @@ def _check_keys(cls, data, where: str):
     expected, found = {f.name for f in fields(cls)}, set(data)
     if expected != found:
         raise ValueError(
-            f"configuration {where!r}: missing keys {sorted(expected - found)}, "
-            f"unknown keys {sorted(found - expected)}"
+            f"configuration {where!r}: missing keys {sorted(expected - found)}, unknown keys {sorted(found - expected)}"
         )
 
 
@@ -153,6 +152,7 @@ PRESETS = {
         text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64, frozen=False),
         dit=DiTConfig(latent_dim=16, text_dim=96, dim=120, layers=6, heads=4),
         train=TrainConfig(
+            bfloat16=True,
             vae_steps=4_000,
             vae_batch=64,
             vae_lr=1e-3,

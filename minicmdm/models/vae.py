@@ -120,7 +120,8 @@ def vae_loss(output: VAEOutput, x: Tensor, cfg: TrainConfig) -> VAELoss:
     recon = _half_log(error.mean())
     root = _half_log(error[..., :ROOT_DIMS].mean()) * ROOT_DIMS / num_features
     # KL( N(mean, exp(logvar)) || N(0,1) ), summed over a sequence's latents, in nats
-    kl = 0.5 * (output.mean.square() + output.logvar.exp() - 1 - output.logvar).sum(dim=(1, 2)).mean()
+    mean, logvar = output.mean.to(x.dtype), output.logvar.to(x.dtype)  # bfloat16 under autocast: too coarse to sum
+    kl = 0.5 * (mean.square() + logvar.exp() - 1 - logvar).sum(dim=(1, 2)).mean()
     kl = kl / (num_frames * num_features)
     return VAELoss(recon + cfg.root_weight * root + cfg.kl_weight * kl, recon, root, kl)
 
