@@ -70,7 +70,7 @@ def evaluate_quick(
     some = everything[:SHUFFLED]
     rng = np.random.default_rng(0)
     mixed = answers([_shuffle(rng, p) for p in prompts], some, "words shuffled")
-    near = nearest_words(clips, progress)
+    near = nearest_words(clips, toy_dataset("train", progress=progress).clips)
 
     def kind(name: str) -> list[int]:
         return [i for i in everything if clips[i].kind == name]
@@ -132,12 +132,11 @@ def field_accuracy(asked: list[Program], found: list[Program]) -> dict[str, floa
     return {name: float(np.mean(values)) for name, values in hits.items() if values}
 
 
-def nearest_words(clips: list[Clip], progress: bool = True) -> list[Program]:
+def nearest_words(clips: list[Clip], train: list[Clip]) -> list[Program]:
     """The baseline: for each prompt, what the oracle reads in the training clip whose caption has the nearest words.
 
     Words are weighed by their rarity (tf-idf) and compared by the angle between the two bags.
     """
-    train = toy_dataset("train", progress=progress).clips
     captions = [(text, k) for k, clip in enumerate(train) for text in clip.captions]
     bags = [_words(text) for text, _ in captions]
     index = {word: i for i, word in enumerate(sorted({w for bag in bags for w in bag}))}
@@ -153,7 +152,7 @@ def nearest_words(clips: list[Clip], progress: bool = True) -> list[Program]:
     table = count(bags)  # (captions, words)
     rarity = np.log(len(bags) / (table > 0).sum(0))
     known = table * rarity
-    known /= np.linalg.norm(known, axis=1, keepdims=True)
+    known /= np.maximum(np.linalg.norm(known, axis=1, keepdims=True), 1e-9)
     asked = count([_words(clip.captions[0]) for clip in clips]) * rarity
     best = [captions[int((known @ row).argmax())][1] for row in asked]
     return [_read(features_to_joints(train[k].features)) for k in best]
