@@ -146,7 +146,10 @@ def fit(
         bar.update(1)
     bar.close()
     if table:
-        draw_losses(table, folder / f"losses_{name}.png", name)
+        from minicmdm.viz.plots import save_loss_curves
+
+        with whole_file(folder / f"losses_{name}.png") as temporary:
+            save_loss_curves(table_file, temporary)
     return LoopResult(ema, metrics, seconds if start >= config.steps else time.perf_counter() - clock)
 
 
@@ -186,19 +189,3 @@ def write_table(path: Path, table: list[dict]) -> None:
         writer = csv.DictWriter(file, columns)
         writer.writeheader()
         writer.writerows(table)
-
-
-def draw_losses(table: list[dict], path: Path, name: str) -> None:
-    """Draw every logged number over the steps, one small axis each."""
-    from matplotlib.figure import Figure  # slow to import, and only needed here
-
-    columns = [c for c in dict.fromkeys(c for row in table for c in row) if c not in ("step", "lr")]
-    figure = Figure(figsize=(4 * len(columns), 3), layout="constrained")
-    for axis, column in zip(figure.subplots(1, len(columns), squeeze=False)[0], columns):
-        points = [(row["step"], row[column]) for row in table if column in row]
-        axis.plot(*zip(*points), lw=1)
-        axis.set(title=f"{name}: {column}", xlabel="step")
-        if min(y for _, y in points) > 0:
-            axis.set_yscale("log")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=90)
