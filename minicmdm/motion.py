@@ -58,14 +58,19 @@ class Motion:
 
         return html_page([self.joints], [self.caption], fps=self.fps)
 
-    def show(self, height: int = 480) -> object:
+    def show(self) -> object:
         """In a notebook, return the player as the cell's output; elsewhere open it in the browser."""
-        page = self.to_html()
         if _in_notebook():
-            from IPython.display import HTML
+            try:
+                from minicmdm.viz.widgets import SkeletonPlayer
 
-            frame = f'<iframe srcdoc="{html.escape(page)}" width="100%" height="{height}" style="border:0"></iframe>'
-            return HTML(frame)
+                return SkeletonPlayer([self.joints], [self.caption], self.fps)
+            except ImportError:  # without the notebooks extra: the page in a frame, which no saved notebook shows
+                from IPython.display import HTML
+
+                page = html.escape(self.to_html())
+                return HTML(f'<iframe srcdoc="{page}" width="100%" height="480" style="border:0"></iframe>')
+        page = self.to_html()
         with tempfile.NamedTemporaryFile("w", suffix=".html", delete=False, encoding="utf-8") as file:
             file.write(page)
         webbrowser.open(Path(file.name).as_uri())
