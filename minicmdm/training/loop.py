@@ -148,6 +148,7 @@ def fit(
     if table:
         from minicmdm.viz.plots import save_loss_curves
 
+        write_table(table_file, table)
         with whole_file(folder / f"losses_{name}.png") as temporary:
             save_loss_curves(table_file, temporary)
     return LoopResult(ema, metrics, seconds if start >= config.steps else time.perf_counter() - clock)
