@@ -11,9 +11,7 @@ from torch import Tensor
 from minicmdm.diffusion.path import interpolate, velocity
 
 
-def draw_times(
-    batch: int, num_latents: int, block_size: int, generator: torch.Generator | None = None
-) -> Tensor:
+def draw_times(batch: int, num_latents: int, block_size: int, generator: torch.Generator | None = None) -> Tensor:
     """Flow times (B,N), uniform on [0,1), one draw per block of latents, on the generator's device."""
     device = generator.device if generator is not None else None
     num_blocks = -(-num_latents // block_size)
