@@ -150,7 +150,7 @@ PRESETS = {
         "toy",
         vae=VAEConfig(latent_dim=16, width=128, depth=2),
         text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64, frozen=False),
-        dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=120, layers=6, heads=4),
         train=TrainConfig(
             bfloat16=True,
             vae_steps=4_000,
