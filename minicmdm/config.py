@@ -160,6 +160,7 @@ PRESETS = {
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows: 0.05 left 23 mm of error, half of it yaw
             dit_steps=6_000,
+            dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
             ema=0.999,
