@@ -1,4 +1,4 @@
-"""The command line: `minicmdm generate | inspect | schedule | data | train | evaluate`.
+"""The command line: `minicmdm demo | generate | inspect | schedule | data | train | evaluate`.
 
 Three habits hold for every command. What others parse (JSON, a matrix) goes to stdout; what people read while they wait
 goes to stderr. Whatever is wrong with a request is said in one line that begins "minicmdm: ", the exit code is 2, and
@@ -81,6 +81,10 @@ def _parser() -> Parser:
         sub.set_defaults(run=run)
         return sub
 
+    sub = command("demo", demo, "Three sentences become three motions: an HTML player and a GIF of each.")
+    sub.add_argument("--out", default="demo", help="folder for the files, made if missing (default demo)")
+    sub.add_argument("--force", action="store_true", help="replace files that exist")
+
     sub = command("generate", generate, "Turn a sentence into a motion: an .html player, a .gif, or an .npy of joints.")
     sub.add_argument("prompt", metavar="PROMPT", help='what to do, for example "a person walks, then waves"')
     sub.add_argument("--out", default="motion.html", help="file to write: .html, .gif or .npy (default motion.html)")
@@ -145,7 +149,8 @@ def generate(arguments: argparse.Namespace) -> None:
     if not prompt.strip():
         raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
     out = check_output(arguments.out, ENDINGS, arguments.force)
-    from minicmdm.pipeline import MotionPipeline  # loads torch
+    _one_thread()
+    from minicmdm.pipeline import MotionPipeline
 
     pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
     motion = pipe(
@@ -162,6 +167,30 @@ def generate(arguments: argparse.Namespace) -> None:
     _say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
 
 
+def demo(arguments: argparse.Namespace) -> None:
+    """`minicmdm demo`: the shipped checkpoint acts out three sentences, and the oracle says what it sees."""
+    from minicmdm.demo import outputs, perform
+
+    files = outputs(Path(arguments.out), arguments.force)
+    _one_thread()
+    for prompt, seen, paths in perform(files, arguments.force):
+        print(f'"{prompt}"\n  the oracle sees: ' + "; ".join(_in_words(segment.to_dict()) for segment in seen))
+        print("  " + "\n  ".join(str(path.resolve()) for path in paths), flush=True)
+
+
+def _one_thread() -> None:
+    """The toy model is too small for two threads: on a busy machine they are ten times slower than one."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _in_words(segment: dict) -> str:
+    said = [str(segment[key]) for key in ("side", "direction", "speed", "overlay") if segment[key]]
+    said += [f"{segment['count']} times"] * bool(segment["count"])
+    return segment["action"] + (f" ({', '.join(said)})" if said else "")
+
+
 def inspect(arguments: argparse.Namespace) -> None:
     """`minicmdm inspect`: segments in order, as the oracle reads them from the joints alone."""
     from minicmdm.motion import load_joints
@@ -174,10 +203,7 @@ def inspect(arguments: argparse.Namespace) -> None:
         print(json.dumps({"segments": segments}))
         return
     for segment in segments:
-        said = ", ".join(
-            f"{key} {segment[key]}" for key in ("side", "direction", "speed", "count", "overlay") if segment[key]
-        )
-        print(f"frames {segment['start']:4d}-{segment['end']:<4d} {segment['action']}" + (f" ({said})" if said else ""))
+        print(f"frames {segment['start']:4d}-{segment['end']:<4d} {_in_words(segment)}")
 
 
 def schedule(arguments: argparse.Namespace) -> None:
@@ -257,6 +283,7 @@ def evaluate(arguments: argparse.Namespace) -> None:
         raise ValueError("evaluate knows one protocol so far: add --quick")
     if arguments.limit is not None and arguments.limit < 1:
         raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
+    _one_thread()
     from minicmdm.evaluation.quick import evaluate_quick
     from minicmdm.pipeline import MotionPipeline
 
