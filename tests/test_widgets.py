@@ -189,10 +189,10 @@ def test_making_a_motion_answers_or_says_why_not(read):
 def test_maker_tries_the_shortest_and_the_longest_before_it_is_shown(read):
     pipe = FakePipe()
     maker = MotionMaker(pipe, "a person walks", 80, seed=5)
-    assert sorted(pipe.asked) == [("a person walks", frames, 5) for frames in (4, 80, 196)]
+    assert sorted(pipe.asked) == [("a person walks", frames, 5) for frames in (40, 80, 196)]
     assert maker.player.data["clips"][0]["frames"] == 80 and maker.said.value.startswith("The oracle reads")
     assert stand_in(maker).width > 100
-    for frames in (4, 80, 196):
+    for frames in (40, 80, 196):
         with pytest.raises(RuntimeError, match="broken"):
             MotionMaker(FakePipe(broken_at=frames), "a person walks", 80)
     with pytest.raises(ValueError, match="prompt is empty"):

@@ -18,7 +18,7 @@ import numpy as np
 from PIL import Image
 
 from minicmdm.data.oracle import read_motion
-from minicmdm.data.programs import Segment
+from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES, Segment
 from minicmdm.data.skeleton import FPS
 from minicmdm.motion import Motion
 from minicmdm.viz.player import player_data, player_script
@@ -203,17 +203,15 @@ def make_motion(pipe, prompt: str, num_frames: int, seed: int) -> tuple[Motion |
 class MotionMaker(ipywidgets.VBox):
     """A sentence, a length and a seed; the button generates, the player plays, the oracle says what it sees."""
 
-    LEAST, GREATEST = 4, 196  # frames
-
     def __init__(self, pipe, prompt: str = "a person walks", num_frames: int = 120, seed: int = 0):
-        for frames in (self.LEAST, self.GREATEST, num_frames):
+        for frames in (MIN_FRAMES, MAX_FRAMES, num_frames):  # the lengths that the toy world knows
             motion, said = make_motion(pipe, prompt, frames, seed)
             if motion is None:
                 raise ValueError(said)
         self._pipe = pipe
         wide = ipywidgets.Layout(width="98%")
         self.prompt = ipywidgets.Text(prompt, description="sentence", layout=wide)
-        self.frames = ipywidgets.IntSlider(num_frames, self.LEAST, self.GREATEST, 4, description="frames")
+        self.frames = ipywidgets.IntSlider(num_frames, MIN_FRAMES, MAX_FRAMES, 4, description="frames")
         self.seed = ipywidgets.BoundedIntText(seed, min=0, max=2**31 - 1, description="seed")
         self.button = ipywidgets.Button(description="Generate", button_style="primary")
         self.said = ipywidgets.Label(said)
