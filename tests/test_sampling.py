@@ -32,8 +32,9 @@ def gaussian_velocity(mean, covariance, causal=False):
 
     def denoise(z_t, t):
         t, v = t[0], torch.empty_like(z_t)
-        for n in range(len(mean)):
-            seen = n + 1 if causal else len(mean)
+        count = z_t.shape[1]  # waiting latents are hidden; they are pure noise and know nothing
+        for n in range(count):
+            seen = n + 1 if causal else count
             T = torch.diag(t[:seen])
             T_noise = torch.eye(seen, dtype=z_t.dtype) - T
             C = covariance[:seen, :seen]
@@ -138,16 +139,32 @@ def test_the_denoiser_is_called_once_per_row_with_the_times_it_starts_from():
         return torch.zeros_like(z_t)
 
     out = sample(denoise, matrix, noise(2, 3, 1))
-    assert np.allclose(seen, 1 - matrix[:-1] / 4)
+    assert len(seen) == len(matrix) - 1
+    for times, levels, after in zip(seen, matrix, matrix[1:]):
+        assert np.allclose(times, 1 - levels[: len(times)] / 4)
+        assert len(times) == np.flatnonzero(levels != after)[-1] + 1  # what waits behind the last mover is hidden
     assert torch.equal(out, noise(2, 3, 1))
 
 
 def test_the_true_velocity_of_one_path_leads_to_its_data_and_says_so_on_the_way():
     data, start = noise(1, 4, 2, seed=3), noise(1, 4, 2)
-    steps = list(sample_steps(lambda z_t, t: data - start, schedule_matrix(4, 5, 2), start))
+    steps = list(sample_steps(lambda z_t, t: (data - start)[:, : z_t.shape[1]], schedule_matrix(4, 5, 2), start))
     assert torch.allclose(steps[-1].z, data)
     moved = torch.from_numpy(steps[0].levels != steps[1].levels)
     assert steps[0].clean is None and torch.allclose(steps[1].clean[:, moved], data[:, moved])
+
+
+def test_hiding_the_waiting_latents_changes_nothing_under_a_causal_mask():
+    model, matrix, start = randomise(CausalDiT(TINY)), schedule_matrix(6, 5, 2), noise(2, 6, 3)
+    words, mask = text(2, 6, 3)
+    hidden = sample(guided(model, words, mask, None, None, 1.0), matrix, start)
+
+    def everything(z_t, t):  # put the waiting ones back: their noise, at level K
+        full, times = torch.cat([z_t, start[:, z_t.shape[1] :]], 1), torch.zeros(2, 6, dtype=t.dtype)
+        times[:, : t.shape[1]] = t
+        return model(full, times, words, mask)[:, : z_t.shape[1]]
+
+    torch.testing.assert_close(hidden, sample(everything, matrix, start), rtol=1e-9, atol=1e-9)
 
 
 def test_a_prefix_stays_and_is_looked_at():
