@@ -62,13 +62,17 @@ def normalise(executed: dict) -> dict:
         if cell["cell_type"] == "code" and "".join(cell["source"]).strip():
             count += 1
             cell["execution_count"] = count
-            kept = [_output(output, cell["id"], count) for output in outputs[cell["id"]]]
-            cell["outputs"] = [output for output in kept if output is not None]
+            for output in outputs[cell["id"]]:
+                output, before = _output(output, cell["id"], count), cell["outputs"][-1:]
+                if before and before[0]["output_type"] == output["output_type"] == "stream":
+                    before[0]["text"] += output["text"]  # how a kernel cuts its text is chance
+                else:
+                    cell["outputs"].append(output)
     executed["metadata"]["minicmdm"]["source"] = stamp
     return executed
 
 
-def _output(output: dict, cell: str, count: int) -> dict | None:
+def _output(output: dict, cell: str, count: int) -> dict:
     if output["output_type"] == "error":
         raise Refused(f"cell {cell}: {output['ename']}: {output['evalue']}")
     if output["output_type"] == "stream":
