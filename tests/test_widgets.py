@@ -71,7 +71,7 @@ def test_a_broken_callback_fails_at_once(broken_at):
 def test_a_slider_redraws_and_an_error_is_shown_where_the_reader_looks():
     def picture(a):
         if a == 5:
-            raise RuntimeError("five is right out")
+            raise RuntimeError("<five> is right out")
         return block(20 * a)
 
     explorer = explore(picture, a=(0, 2, 9))
@@ -79,7 +79,7 @@ def test_a_slider_redraws_and_an_error_is_shown_where_the_reader_looks():
     explorer.inputs["a"].value = 7
     assert explorer.image.value == widgets.png(block(140))
     explorer.inputs["a"].value = 5
-    assert explorer.problem.value == "RuntimeError: five is right out"
+    assert explorer.problem.value == "RuntimeError: &lt;five&gt; is right out"
     explorer.inputs["a"].value = 3
     assert explorer.problem.value == "" and explorer.image.value == widgets.png(block(60))
     assert stand_in(explorer).getpixel((5, 5)) == (60, 0, 0)

@@ -11,6 +11,7 @@ page). Nothing is loaded from the network.
 from __future__ import annotations
 
 import base64
+import html
 import io
 from collections.abc import Callable
 
@@ -91,7 +92,7 @@ class Explorer(ipywidgets.VBox):
         self.image = ipywidgets.Image(value=first, format="png")
         self.image.layout.max_width = "100%"
         self.image.layout.object_fit = "contain"
-        self.problem = ipywidgets.Label()  # what went wrong, where the reader looks
+        self.problem = ipywidgets.HTML()  # what went wrong, where the reader looks
         for widget in inputs.values():
             widget.observe(self._update, "value")
         super().__init__([*inputs.values(), self.image, self.problem])
@@ -101,7 +102,7 @@ class Explorer(ipywidgets.VBox):
             self.image.value = png(self._fn(**{name: widget.value for name, widget in self.inputs.items()}))
             self.problem.value = ""
         except Exception as error:
-            self.problem.value = f"{type(error).__name__}: {error}"
+            self.problem.value = html.escape(f"{type(error).__name__}: {error}", quote=False)
 
     def _repr_mimebundle_(self, **options):
         return _with_png(super()._repr_mimebundle_(**options), Image.open(io.BytesIO(self.image.value)))
@@ -214,7 +215,7 @@ class MotionMaker(ipywidgets.VBox):
         self.frames = ipywidgets.IntSlider(num_frames, MIN_FRAMES, MAX_FRAMES, 4, description="frames")
         self.seed = ipywidgets.BoundedIntText(seed, min=0, max=2**31 - 1, description="seed")
         self.button = ipywidgets.Button(description="Generate", button_style="primary")
-        self.said = ipywidgets.Label(said)
+        self.said = ipywidgets.HTML(html.escape(said, quote=False))  # unlike a Label it breaks long lines
         self.player = SkeletonPlayer([motion.joints], [motion.caption])
         self.button.on_click(self._generate)
         self.button.add_class("minicmdm-generate")  # hooks for tests in a browser
@@ -225,13 +226,12 @@ class MotionMaker(ipywidgets.VBox):
     def _generate(self, _button) -> None:
         self.button.disabled, self.said.value = True, "generating ..."
         try:
-            motion, self.said.value = make_motion(self._pipe, self.prompt.value, self.frames.value, self.seed.value)
+            motion, said = make_motion(self._pipe, self.prompt.value, self.frames.value, self.seed.value)
             if motion is not None:
                 self.player.play([motion.joints], [motion.caption])
         except Exception as error:  # a button's error would vanish unseen
-            self.said.value = f"{type(error).__name__}: {error}"
-        finally:
-            self.button.disabled = False
+            said = f"{type(error).__name__}: {error}"
+        self.button.disabled, self.said.value = False, html.escape(said, quote=False)
 
     def _repr_mimebundle_(self, **options):
         return _with_png(super()._repr_mimebundle_(**options), self.player.picture())
