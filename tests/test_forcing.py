@@ -15,7 +15,8 @@ def seeded(seed=0):
 
 @pytest.mark.parametrize("block_size", [1, 3])
 def test_times_are_uniform_equal_in_a_block_and_independent_between_blocks(block_size):
-    t = draw_times(4000, 7, block_size, seeded())
+    t, asked = draw_times(4000, 7, block_size, seeded())
+    assert asked.all()
     assert t.shape == (4000, 7) and t.min() >= 0 and t.max() < 1
     assert torch.allclose(t.mean(0), torch.tensor(0.5), atol=0.02)
     assert torch.allclose(t.var(0), torch.tensor(1 / 12), atol=0.005)
@@ -71,3 +72,32 @@ def test_the_model_receives_text_and_mask_as_they_are():
 
     diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", "mask", None, block_size=3)
     assert seen == [(torch.Size([2, 6]), "words", "mask", None)]
+
+
+@pytest.mark.parametrize("block_size", [1, 3])
+def test_a_staircase_never_has_a_past_noisier_than_the_present(block_size):
+    t, asked = draw_times(2000, 12, block_size, seeded(), staircase=1.0)
+    assert asked[(t > 0) & (t < 1)].all() and not asked[t == 1].any()
+    waiting = (t == 0) & asked  # at most the one block that starts next
+    assert waiting.sum(1).max() <= block_size and waiting.any()
+    assert t.min() >= 0 and t.max() <= 1 and (t.diff(dim=1) <= 1e-6).all()
+    steps = -t.diff(dim=1)[:, block_size - 1 :: block_size]
+    inner = steps[(t[:, :-1][:, block_size - 1 :: block_size] < 1) & (t[:, 1:][:, block_size - 1 :: block_size] > 0)]
+    assert inner.max() <= 0.15 + 1e-6 and inner.min() < 0.01  # from full-sequence to steeper than FSS
+    half, _ = draw_times(2000, 12, block_size, seeded(), staircase=0.5)
+    falling = (half.diff(dim=1) <= 1e-6).all(1).float().mean()
+    assert 0.45 < falling < 0.56
+
+
+def test_finished_latents_are_context_and_not_asked():
+    z = torch.randn(64, 12, 3, dtype=torch.float64)
+    seen = []
+
+    def model(z_t, t, *_):
+        seen.append((z_t.detach(), t))
+        return torch.where((t == 1)[..., None], torch.full_like(z_t, 1e6), torch.zeros_like(z_t))
+
+    loss = diffusion_forcing_loss(model, z, None, None, generator=seeded(), staircase=1.0)
+    z_t, t = seen[0]
+    assert (t == 1).any() and torch.equal(z_t[t == 1], z[t == 1])
+    assert loss < 10  # the wild answers at finished latents cost nothing
