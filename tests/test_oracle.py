@@ -120,6 +120,13 @@ def test_a_mirrored_motion_is_read_mirrored(clips, motions):
     assert len(sided) > 100 and sum(passes(p, r) for p, r in sided) == 0
 
 
+@pytest.mark.parametrize("frames", [4, 5, 12, 24, 25, 26])
+def test_short_clips_are_read_too(motions, frames):
+    for joints in motions[:40]:
+        reading = read_motion(joints[30 : 30 + frames])
+        assert reading and all(0 <= s.start < s.end <= frames for s in reading)
+
+
 def test_bad_input_is_refused():
     with pytest.raises(ValueError, match="22, 3"):
         read_motion(np.zeros((10, 21, 3)))

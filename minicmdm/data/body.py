@@ -77,7 +77,8 @@ def bridge(mask: np.ndarray, gap: int) -> np.ndarray:
 
 
 def grow(mask: np.ndarray, by: int) -> np.ndarray:
-    return np.convolve(mask, np.ones(2 * by + 1), "same") > 0
+    """True within `by` frames of a True, for clips of any length."""
+    return np.convolve(mask, np.ones(2 * by + 1))[by : by + len(mask)] > 0
 
 
 def covered(episodes: list[Segment], frames: int) -> np.ndarray:

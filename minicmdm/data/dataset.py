@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minicmdm.data import grammar, moves, oracle, programs, synthesis
+from minicmdm.data import body, grammar, moves, oracle, programs, synthesis
 from minicmdm.data.features import canonicalize, joints_to_features
 from minicmdm.data.programs import (
     HELDOUT_PAIRS,
@@ -71,9 +71,8 @@ class MotionDataset:
 
 def world_fingerprint() -> str:
     """A hash of the sources that make the toy world and its oracle: two numbers compare only under the same one."""
-    text = "".join(inspect.getsource(m) for m in (programs, grammar, moves, synthesis, oracle)) + inspect.getsource(
-        make_clip
-    )
+    sources = (programs, grammar, moves, synthesis, body, oracle, make_clip)
+    text = "".join(inspect.getsource(source) for source in sources)
     return hashlib.sha256(text.replace("\r\n", "\n").encode()).hexdigest()[:16]
 
 
