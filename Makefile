@@ -9,8 +9,12 @@ endif
 # One thread each: two torch threads on a busy two-core machine are about ten times slower than one.
 export OMP_NUM_THREADS := 1
 export HF_HUB_OFFLINE := 1
+ifdef PIP_FIND_LINKS
 export UV_FIND_LINKS := $(PIP_FIND_LINKS)
-INSTALL = $(BIN)/uv pip install -q --python $(BIN)/python
+endif
+# INDEX=https://download.pytorch.org/whl/cpu spares a Linux machine without a GPU gigabytes of CUDA.
+INSTALL = $(BIN)/uv pip install -q --python $(BIN)/python \
+  $(if $(INDEX),--extra-index-url $(INDEX) --index-strategy unsafe-best-match)
 
 .PHONY: demo test quick lint notebooks clean
 

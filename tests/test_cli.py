@@ -90,6 +90,8 @@ BAD = {
     "empty output": (["generate", "walks", "--out", ""], "empty"),
     "missing parent": (["generate", "walks", "--out", "no/new.npy"], "does not exist"),
     "file as parent": (["generate", "walks", "--out", "mine.npy/new.npy"], "does not exist"),
+    "demo into a file": (["demo", "--out", "mine.npy"], "is a file"),
+    "demo without parent": (["demo", "--out", "no/demo"], "does not exist"),
     "inspect nothing": (["inspect", "absent.npy"], "absent.npy"),
     "inspect folder": (["inspect", "full"], "is a folder"),
     "inspect flat": (["inspect", "flat.npy"], "(T,22,3)"),

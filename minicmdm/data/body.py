@@ -82,6 +82,7 @@ def grow(mask: np.ndarray, by: int) -> np.ndarray:
 
 
 def covered(episodes: list[Segment], frames: int) -> np.ndarray:
+    """The frames that some episode holds already: (frames,) bool."""
     out = np.zeros(frames, bool)
     for e in episodes:
         out[e.start : e.end] = True
