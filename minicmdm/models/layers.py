@@ -114,14 +114,14 @@ class Attention(nn.Module):
     def attend(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor, positions=None) -> Tensor:
         """x (B,N,dim) looks at keys and values (B,H,S,d) where mask (N,S) or (B,N,S) is True -> (B,N,dim)."""
         queries = self.split(self.query_norm(self.query(x)), positions)
+        queries = queries * queries.shape[-1] ** -0.5  # here rather than on the scores, which are more numbers
         mask = mask if mask.ndim == 2 else mask.unsqueeze(1)  # (B,N,S) -> (B,1,N,S): the same for all heads
-        scores = queries @ keys.transpose(-1, -2) * queries.shape[-1] ** -0.5  # (B,H,N,S)
+        scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
         weights = scores.masked_fill(~mask, torch.finfo(scores.dtype).min).softmax(-1)
         # A query that may look at nothing has a softmax over equal scores; its answer is zero, not their mean.
-        weights = weights * mask.any(-1, keepdim=True)
         # Written out rather than `scaled_dot_product_attention`: with 49 latents there is no memory to save, and on
         # a CPU in bfloat16 the fused backward pass is ten times slower than this.
-        out = weights.to(values.dtype) @ values  # (B,H,N,d)
+        out = weights.to(values.dtype) @ values * mask.any(-1, keepdim=True)  # (B,H,N,d)
         return self.out(out.transpose(1, 2).flatten(2))  # (B,N,dim)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor, positions=None) -> Tensor:

@@ -107,7 +107,7 @@ def fit(
     ema = copy.deepcopy(models).eval().requires_grad_(False)
     weights = [weight for weight in models.parameters() if weight.requires_grad]
     optimizer = torch.optim.AdamW(
-        weights, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, foreach=True
+        weights, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=True
     )
     start, seconds, table, metrics = 0, 0.0, [], {}
     if resume and state_file.is_file():
