@@ -76,7 +76,6 @@ class TrainConfig:
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
     ema: float = 0.9999
-    staircase: float = 0.0  # share of samples whose levels fall along the sequence; 0 is the paper (forcing.py)
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
     # both
     betas: tuple[float, float] = (0.9, 0.99)
@@ -160,9 +159,8 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows: 0.05 left 23 mm of error, half of it yaw
-            dit_steps=7_500,
+            dit_steps=6_000,
             dit_batch=48,
-            staircase=0.7,
             dit_lr=1.5e-3,
             dit_warmup=300,
             ema=0.999,

@@ -15,8 +15,7 @@ def seeded(seed=0):
 
 @pytest.mark.parametrize("block_size", [1, 3])
 def test_times_are_uniform_equal_in_a_block_and_independent_between_blocks(block_size):
-    t, asked = draw_times(4000, 7, block_size, seeded())
-    assert asked.all()
+    t = draw_times(4000, 7, block_size, seeded())
     assert t.shape == (4000, 7) and t.min() >= 0 and t.max() < 1
     assert torch.allclose(t.mean(0), torch.tensor(0.5), atol=0.02)
     assert torch.allclose(t.var(0), torch.tensor(1 / 12), atol=0.005)
@@ -64,47 +63,11 @@ def test_the_seed_decides():
 
 
 def test_the_model_receives_text_and_mask_as_they_are():
-    seen, mask = [], torch.rand(2, 6, 5) < 0.5
+    seen = []
 
     def model(z_t, t, words, word_mask, valid):
         seen.append((t.shape, words, word_mask, valid))
         return z_t
 
-    diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", mask, None, block_size=3)
-    ((shape, words, word_mask, valid),) = seen
-    assert (shape, words, valid) == (torch.Size([2, 6]), "words", None) and torch.equal(word_mask, mask)
-
-
-@pytest.mark.parametrize("block_size", [1, 3])
-def test_a_staircase_never_has_a_past_noisier_than_the_present(block_size):
-    generator, falling, steps = seeded(), 0, []
-    for _ in range(300):
-        t, asked = draw_times(8, 12, block_size, generator, staircase=0.5)
-        assert t.min() >= 0 and t.max() <= 1
-        if (t.diff(dim=1) <= 1e-6).all():
-            falling += 1
-            assert asked[(t > 0) & (t < 1)].all() and not asked[t == 1].any()
-            assert ((t == 0) & asked).sum(1).max() <= block_size  # at most the one block that starts next
-            blocks = t[:, ::block_size]
-            inner = (blocks[:, :-1] < 1) & (blocks[:, 1:] > 0)
-            steps.append(-blocks.diff(dim=1)[inner])
-    steps = torch.cat(steps)
-    assert 120 < falling < 180
-    assert steps.max() <= 0.15 + 1e-6 and steps.min() < 0.01  # from full-sequence to steeper than FSS
-
-
-def test_only_what_a_sampler_would_move_is_asked_and_what_waits_is_hidden():
-    z = torch.randn(8, 12, 3, dtype=torch.float64)
-    calls = []
-
-    def model(z_t, t, *_):
-        calls.append((z_t.detach(), t))
-        return torch.where((t == 1)[..., None], torch.full_like(z_t, 1e6), torch.zeros_like(z_t))
-
-    for seed in range(40):
-        loss = diffusion_forcing_loss(model, z, None, None, generator=seeded(seed), staircase=1.0)
-        assert loss < 10  # the wild answers at finished latents cost nothing
-    for z_t, t in calls:
-        assert torch.equal(z_t[t == 1], z[:, : t.shape[1]][t == 1])
-        assert (t == 0).sum(1).max() <= 1  # hidden: nobody sees a second waiting latent
-    assert any((t == 1).any() for _, t in calls) and len({t.shape[1] for _, t in calls}) > 5
+    diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", "mask", None, block_size=3)
+    assert seen == [(torch.Size([2, 6]), "words", "mask", None)]

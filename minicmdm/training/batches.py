@@ -19,7 +19,7 @@ from minicmdm.models.text import Words
 from minicmdm.models.vae import MACVAE
 
 WHOLE, SEGMENTS, CROPPED = 0, 1, 2  # the three ways to show a clip
-SHARES = (0.7, 0.15, 0.15)  # how often each is drawn
+SHARES = (0.6, 0.2, 0.2)  # how often each is drawn
 SHORTEST_CROP = 4  # latents
 POOL = 8  # batches are cut from a pool of this many batches, sorted by length, so that little is padding
 
