@@ -96,6 +96,8 @@ def evaluate_quick(
         "oracle_accuracy_unshuffled": share(found, some),  # the same prompts as _shuffled, in order
         "mpjpe_mm": float(np.mean([reconstruction_error(pipe, clip) for clip in clips])),
     }
+    for parts in (1, 2, 3):
+        numbers[f"oracle_accuracy_clip_{parts}_part"] = whole(found, [i for i in everything if len(asked[i]) == parts])
     numbers |= {f"field_{name}": value for name, value in field_accuracy(asked, found).items()}
     return {
         **{key: round(value, 4) for key, value in numbers.items()},
