@@ -267,3 +267,12 @@ def test_a_sentence_is_utf8_whatever_the_locale_made_of_it():
     escaped = "a persön".encode().decode("ascii", "surrogateescape")  # what LC_ALL=C hands to Python
     assert cli._as_typed(escaped) == "a persön"
     assert cli._as_typed("pers\udcf6n") == "pers\udcf6n"  # a Latin-1 byte: left for the pipeline to refuse
+
+
+def test_demo_writes_a_player_and_a_gif_of_each_scene(tmp_path, capsys):
+    assert cli.main(["demo", "--out", str(tmp_path / "demo")]) == 0
+    files = sorted(file.suffix for file in (tmp_path / "demo").iterdir())
+    assert files == [".gif"] * 3 + [".html"] * 3
+    said = capsys.readouterr().out
+    assert said.count("the oracle sees: ") == 3 and said.count(str(tmp_path)) == 6
+    assert cli.main(["demo", "--out", str(tmp_path / "demo")]) == 2  # and overwrites nothing unasked

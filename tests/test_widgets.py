@@ -148,7 +148,8 @@ def test_script_needs_no_network():
 @pytest.mark.skipif(shutil.which("node") is None, reason="node checks the script's syntax")
 def test_script_is_a_module_that_a_browser_can_read(tmp_path):
     (tmp_path / "player.mjs").write_text(str(SkeletonPlayer._esm), encoding="utf-8")
-    subprocess.run(["node", "--check", tmp_path / "player.mjs"], check=True)
+    run = subprocess.run(["node", "--check", tmp_path / "player.mjs"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
 
 
 # --- notebook 00: sentence, length, seed ------------------------------------------------------------------------------
