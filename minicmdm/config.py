@@ -39,6 +39,20 @@ class TextConfig:
 
 
 @dataclass(frozen=True)
+class TMRConfig:
+    """Part-TMR, the teacher that aligns the VAE and teaches the text encoder (CMDM 3.1, A.1)."""
+
+    dim: int = 512
+    layers: int = 4
+    heads: int = 4
+    embed_dim: int = 256
+    parts: str = "six"  # or "one": plain TMR, the whole body as one part
+    causal: bool = False  # True: frame features that have not seen the future, as the latents they teach
+    mean: str = "valid"  # over time; "padded" counts the padding too, as the release does
+    dropout: float = 0.1
+
+
+@dataclass(frozen=True)
 class DiTConfig:
     """Causal-DiT (CMDM Table 10). The feed-forward width is always 2 * dim, as the table's counts imply."""
 
