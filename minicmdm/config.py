@@ -64,6 +64,7 @@ class DiTConfig:
     time_dim: int = 256
     block_size: int = 1  # latents that see each other both ways: 1 is the paper's text, 3 the released code
     attention: str = "causal"  # or "bidirectional"
+    clock: bool = False  # True (ours): each latent knows how far into its sentence it is, and what is left if known
 
     @property
     def feedforward_dim(self) -> int:
@@ -164,7 +165,7 @@ PRESETS = {
         "toy",
         vae=VAEConfig(latent_dim=16, width=128, depth=2),
         text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64, frozen=False),
-        dit=DiTConfig(latent_dim=16, text_dim=96, dim=120, layers=6, heads=4),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4, clock=True),
         train=TrainConfig(
             bfloat16=True,
             vae_steps=4_000,

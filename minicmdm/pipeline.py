@@ -120,7 +120,9 @@ class MotionPipeline:
         mask = words.mask[:, None, :].expand(-1, num_latents, -1)  # (B,N,S): every latent sees the whole sentence
         null_mask = null.mask[:, None, :].expand(batch, num_latents, -1)
         null_words = null.embeddings.expand(batch, -1, -1)
-        denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid)
+        place = torch.arange(num_latents, dtype=torch.float32).expand(batch, -1)
+        clock = torch.stack([place, valid.sum(1, keepdim=True) - 1 - place], dim=-1)  # (B,N,2): all is one sentence
+        denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid, clock)
         latents = sample(denoise, matrix, noise)  # (B,N,C)
         return self.decode(latents).numpy()
 

@@ -65,9 +65,9 @@ def test_the_seed_decides():
 def test_the_model_receives_text_and_mask_as_they_are():
     seen = []
 
-    def model(z_t, t, words, word_mask, valid):
-        seen.append((t.shape, words, word_mask, valid))
+    def model(z_t, t, words, word_mask, valid, clock):
+        seen.append((t.shape, words, word_mask, valid, clock))
         return z_t
 
-    diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", "mask", None, block_size=3)
-    assert seen == [(torch.Size([2, 6]), "words", "mask", None)]
+    diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", "mask", None, block_size=3, clock="clock")
+    assert seen == [(torch.Size([2, 6]), "words", "mask", None, "clock")]

@@ -85,33 +85,36 @@ def guided(
     null_mask: Tensor,
     guidance_scale: float,
     valid: Tensor | None = None,
+    clock: Tensor | None = None,
 ) -> Denoise:
     """Bind the text to a model: a denoiser that returns v = v_null + s (v_text - v_null).
 
     words (B,S,E) and mask (B,N,S) are the sentence's, null_words (B,S',E) and null_mask (B,N,S') those of
     "". Both branches run in one batch of 2B. A scale of 1 is the plain conditional model, and 0 the
-    unconditional one; each runs one branch. ValueError: a scale that is not a finite number.
+    unconditional one; each runs one branch. valid (B,N) and clock (B,N,2) are the model's own. ValueError: a scale that is not a finite number.
     """
     if not np.isfinite(guidance_scale):
         raise ValueError(f"guidance_scale must be a finite number, got {guidance_scale!r}")
 
-    def one(words: Tensor, mask: Tensor, valid: Tensor | None) -> Denoise:
+    def one(words: Tensor, mask: Tensor, times: int = 1) -> Denoise:
+        more = [None if x is None else torch.cat([x] * times) for x in (valid, clock)]
+
         def denoise(z_t: Tensor, t: Tensor) -> Tensor:
             seen = z_t.shape[1]  # a call may hide the latents at the end
-            return model(z_t, t, words, mask[:, :seen], None if valid is None else valid[:, :seen])
+            return model(z_t, t, words, mask[:, :seen], *(None if x is None else x[:, :seen] for x in more))
 
         return denoise
 
     if guidance_scale == 1:
-        return one(words, mask, valid)
+        return one(words, mask)
     if guidance_scale == 0:
-        return one(null_words, null_mask, valid)
+        return one(null_words, null_mask)
 
     # Pad the shorter sentence with words nobody sees, so that both fit in one batch.
     length = max(words.shape[1], null_words.shape[1])
     both_words = torch.cat([_pad(words, length, axis=1), _pad(null_words, length, axis=1)])  # (2B,S,E)
     both_masks = torch.cat([_pad(mask, length, axis=2), _pad(null_mask, length, axis=2)])  # (2B,N,S)
-    both = one(both_words, both_masks, None if valid is None else torch.cat([valid, valid]))
+    both = one(both_words, both_masks, times=2)
 
     def denoise(z_t: Tensor, t: Tensor) -> Tensor:
         v_text, v_null = both(torch.cat([z_t, z_t]), torch.cat([t, t])).chunk(2)  # 2 x (B,N,C)

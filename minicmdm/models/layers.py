@@ -53,9 +53,10 @@ class RMSNorm(nn.Module):
         self.eps = eps
 
     def forward(self, x: Tensor) -> Tensor:
-        # The power of two happens in float32 even under autocast, where x may be bfloat16.
-        wide = x if x.dtype == torch.float64 else x.float()
-        return (wide * torch.rsqrt(wide.square().mean(-1, keepdim=True) + self.eps)).to(x.dtype) * self.weight
+        # Under autocast x is bfloat16: too coarse to add up squares, good enough for the squares themselves.
+        wide = torch.promote_types(x.dtype, torch.float32)
+        scale = torch.rsqrt((x * x).mean(-1, keepdim=True, dtype=wide) + self.eps)
+        return x * scale.to(x.dtype) * self.weight.to(x.dtype)
 
 
 def modulate(x: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
@@ -74,17 +75,18 @@ def sinusoid(t: Tensor, dim: int) -> Tensor:
 def rotate(x: Tensor, positions: Tensor) -> Tensor:
     """Rotary position embedding (RoPE): turn each channel pair by an angle proportional to the position.
 
-    A pair is read as one complex number and multiplied by e^(i angle). A dot product of two rotated vectors then
-    depends on the difference of their positions only. Nothing is tabled, so there is no longest sequence.
-    x (B,N,H,d) with d even, positions (N,).
+    Channel i of the first half and channel i of the second are the two coordinates of a pair. A dot product of two
+    rotated vectors then depends on the difference of their positions only. Nothing is tabled, so there is no longest
+    sequence. x (B,N,H,d) with d even, positions (N,).
     """
     half = x.shape[-1] // 2
-    wide = x if x.dtype == torch.float64 else x.float()  # there is no complex bfloat16
-    exponent = torch.arange(half, device=x.device, dtype=wide.dtype) / half
-    angle = positions.to(wide.dtype)[:, None, None] * 10_000.0**-exponent  # (N,1,d/2)
-    pairs = torch.view_as_complex(wide.unflatten(-1, (half, 2)))  # (B,N,H,d/2)
-    turned = pairs * torch.polar(torch.ones_like(angle), angle)
-    return torch.view_as_real(turned).flatten(-2).to(x.dtype)
+    wide = torch.promote_types(x.dtype, torch.float32)  # an angle in bfloat16 would be off by whole latents
+    exponent = torch.arange(half, device=x.device, dtype=wide) / half
+    angle = positions.to(wide)[:, None, None] * 10_000.0**-exponent  # (N,1,d/2)
+    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
+    a, b = x.chunk(2, dim=-1)  # 2 x (B,N,H,d/2)
+    # Real numbers: the complex product that says the same in one line is thirty times slower on a CPU.
+    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
 
 
 class Attention(nn.Module):
@@ -116,12 +118,17 @@ class Attention(nn.Module):
         queries = self.split(self.query_norm(self.query(x)), positions)
         queries = queries * queries.shape[-1] ** -0.5  # here rather than on the scores, which are more numbers
         mask = mask if mask.ndim == 2 else mask.unsqueeze(1)  # (B,N,S) -> (B,1,N,S): the same for all heads
-        scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
-        weights = scores.masked_fill(~mask, torch.finfo(scores.dtype).min).softmax(-1)
-        # A query that may look at nothing has a softmax over equal scores; its answer is zero, not their mean.
         # Written out rather than `scaled_dot_product_attention`: with 49 latents there is no memory to save, and on
-        # a CPU in bfloat16 the fused backward pass is ten times slower than this.
-        out = weights.to(values.dtype) @ values * mask.any(-1, keepdim=True)  # (B,H,N,d)
+        # a CPU in bfloat16 the fused backward pass is ten times slower than this. Autocast is off because it would
+        # widen every score to float32; a softmax sums in float32 by itself.
+        with torch.autocast(x.device.type, enabled=False):
+            keys, values = keys.to(queries.dtype), values.to(queries.dtype)
+            scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
+            weights = scores.masked_fill(~mask, torch.finfo(scores.dtype).min).softmax(-1)
+            out = weights @ values  # (B,H,N,d)
+        # A query that may look at nothing has a softmax over equal scores; its answer is zero, not their mean.
+        nothing = ~mask.any(-1, keepdim=True)
+        out = out.masked_fill(nothing, 0.0) if nothing.any() else out
         return self.out(out.transpose(1, 2).flatten(2))  # (B,N,dim)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor, positions=None) -> Tensor:

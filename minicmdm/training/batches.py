@@ -21,6 +21,7 @@ from minicmdm.models.vae import MACVAE
 WHOLE, SEGMENTS, CROPPED = 0, 1, 2  # the three ways to show a clip
 SHARES = (0.6, 0.2, 0.2)  # how often each is drawn
 SHORTEST_CROP = 4  # latents
+LENGTH_DROP = 0.3  # how often a sample does not say how long its sentences last
 POOL = 8  # batches are cut from a pool of this many batches, sorted by length, so that little is padding
 
 
@@ -109,6 +110,7 @@ class DenoiserBatch:
     sentences: list[str]  # every different sentence of the batch, once
     choice: Tensor  # (B,R) index into `sentences`; -1 where a sample has fewer than R
     owner: Tensor  # (B,N) which of its sample's R sentences a latent sees
+    clock: Tensor  # (B,N,2) latents since its sentence began, and left of it (-1: hidden)
 
 
 def draw_batch(
@@ -116,41 +118,57 @@ def draw_batch(
 ) -> DenoiserBatch:
     """Draw a batch: clips of like length, sampled latents, sentences by one of the three ways, some text dropped."""
     pool = torch.randint(len(latents), (POOL * count,), generator=generator).tolist()
-    pool.sort(key=lambda i: len(latents.means[i]))
+    ways = torch.multinomial(torch.tensor(shares), POOL * count, replacement=True, generator=generator).tolist()
+    luck = torch.rand(POOL * count, 4, generator=generator).tolist()
+    begins = [
+        1 + int(where * (len(latents.means[i]) - SHORTEST_CROP))  # 1 .. total - SHORTEST_CROP
+        if way == CROPPED and latents.sentences[i] and len(latents.means[i]) > SHORTEST_CROP
+        else 0
+        for i, way, (where, _, _, _) in zip(pool, ways, luck)
+    ]
+    by_length = sorted(range(len(pool)), key=lambda k: len(latents.means[pool[k]]) - begins[k])
     slot = int(torch.randint(POOL, (), generator=generator))
-    chosen = pool[slot * count : (slot + 1) * count]  # every clip of the pool is as likely as any other
-    ways = torch.multinomial(torch.tensor(shares), count, replacement=True, generator=generator).tolist()
-    luck = torch.rand(count, 3, generator=generator).tolist()
     table: dict[str, int] = {}  # sentence -> its place in the batch's list
     samples = []
-    for i, way, (where, which, dropped) in zip(chosen, ways, luck):
-        total = len(latents.means[i])
-        begin, owner, sentences = 0, latents.owners[i], latents.sentences[i]
-        if not sentences or way == WHOLE:  # a clip without labels has its caption only
+    for k in by_length[slot * count : (slot + 1) * count]:  # every clip of the pool is as likely as any other
+        i, begin, (_, which, dropped, hidden) = pool[k], begins[k], luck[k]
+        owner, sentences = latents.owners[i], latents.sentences[i]
+        if not sentences or ways[k] == WHOLE:  # a clip without labels has its caption only
             captions = latents.captions[i]
             sentences, owner = [captions[int(which * len(captions))]], torch.zeros_like(owner)
-        elif way == CROPPED and total > SHORTEST_CROP:
-            begin = 1 + int(where * (total - SHORTEST_CROP))  # 1 .. total - SHORTEST_CROP
         if dropped < text_drop:
             sentences, owner = [""], torch.zeros_like(owner)
         places = [table.setdefault(sentence, len(table)) for sentence in sentences]
-        samples.append((i, begin, places, owner[begin:]))
+        samples.append((i, begin, places, owner[begin:], sentence_clock(owner, hidden < LENGTH_DROP)[begin:]))
 
-    longest = max(len(owner) for _, _, _, owner in samples)
-    most = max(len(places) for _, _, places, _ in samples)
+    longest = max(len(owner) for _, _, _, owner, _ in samples)
+    most = max(len(places) for _, _, places, _, _ in samples)
     channels = latents.shift.shape[0]
     mean, std = torch.zeros(count, longest, channels), torch.zeros(count, longest, channels)
     valid = torch.zeros(count, longest, dtype=torch.bool)
     choice = torch.full((count, most), -1)
     owners = torch.zeros(count, longest, dtype=torch.long)
-    for row, (i, begin, places, owner) in enumerate(samples):
+    clocks = torch.zeros(count, longest, 2)
+    for row, (i, begin, places, owner, clock) in enumerate(samples):
         n = len(owner)
         mean[row, :n], std[row, :n] = latents.means[i][begin:], latents.stds[i][begin:]
         valid[row, :n] = True
         choice[row, : len(places)] = torch.tensor(places)
-        owners[row, :n] = owner
+        owners[row, :n], clocks[row, :n] = owner, clock
     z = mean + std * torch.randn(mean.shape, generator=generator)  # a posterior sample; std is 0 in the padding
-    return DenoiserBatch(z, valid, list(table), choice, owners)
+    return DenoiserBatch(z, valid, list(table), choice, owners, clocks)
+
+
+def sentence_clock(owner: Tensor, hide_length: bool = False) -> Tensor:
+    """For every latent, how many latents ago its sentence began and how many are left of it. owner (N,) -> (N,2)
+
+    `owner` numbers the sentences in the order in which they begin. What is left is -1 (unknown) with `hide_length`: in
+    an endless stream nobody can say how long a sentence will last.
+    """
+    begins, ends = torch.searchsorted(owner, owner), torch.searchsorted(owner, owner, right=True)  # (N,) each
+    place = torch.arange(len(owner))
+    left = torch.full_like(place, -1) if hide_length else ends - 1 - place
+    return torch.stack([place - begins, left], dim=-1).float()
 
 
 def words_per_latent(words: Words, choice: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:

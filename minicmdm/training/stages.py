@@ -187,7 +187,9 @@ def denoising_loss(
     with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
         encoded = models["text"].encode(batch.sentences)  # each different sentence once
         words, mask = words_per_latent(encoded, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
-        return diffusion_forcing_loss(models["dit"], batch.z, words, mask, batch.valid, plan.dit.block_size, generator)
+        return diffusion_forcing_loss(
+            models["dit"], batch.z, words, mask, batch.valid, plan.dit.block_size, generator, batch.clock
+        )
 
 
 def _text_encoder(plan: Preset, train_set: MotionDataset, out: Path, resume: bool) -> TextEncoder:
