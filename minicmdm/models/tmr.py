@@ -76,21 +76,20 @@ class PartBlock(nn.Module):
         self.up, self.down = PartLinear(parts, dim, 2 * dim), PartLinear(parts, 2 * dim, dim)
         self.dropout = nn.Dropout(dropout)
 
-    def forward(self, x: Tensor, hidden: Tensor) -> Tensor:
-        """hidden (1 or B,T,T) is True where a frame (row) may not look."""
-        x = x + self.dropout(self.out(self.attend(self.qkv(F.layer_norm(x, (self.dim,))), hidden)))
+    def forward(self, x: Tensor, bias: Tensor) -> Tensor:
+        """bias (1 or B,T,T) is added to the scores: 0 where a frame (row) may look, hugely negative elsewhere."""
+        x = x + self.dropout(self.out(self.attend(self.qkv(F.layer_norm(x, (self.dim,))), bias)))
         return x + self.dropout(self.down(F.gelu(self.up(F.layer_norm(x, (self.dim,))))))
 
-    def attend(self, qkv: Tensor, hidden: Tensor) -> Tensor:
-        frames = hidden.shape[-1]
+    def attend(self, qkv: Tensor, bias: Tensor) -> Tensor:
+        frames = bias.shape[-1]
         qkv = qkv.view(len(qkv), -1, frames, 3, self.heads, self.dim // self.heads)  # (P,M,3*dim) -> (P,B,T,3,H,d)
         queries, keys, values = qkv.permute(3, 0, 1, 4, 2, 5)  # 3 x (P,B,H,T,d)
-        # Written out and without autocast: models/layers.py says why.
+        # Written out and without autocast: models/layers.py says why. The scores are most of the work here, and a sum
+        # in place costs less than `masked_fill`, whose backward pass fills again.
         with torch.autocast(qkv.device.type, enabled=False):
             scores = (queries * queries.shape[-1] ** -0.5) @ keys.transpose(-1, -2)  # (P,B,H,T,T)
-            # In place, for there are many scores; a frame that sees nothing gets equal ones and stays finite.
-            weights = scores.masked_fill_(hidden.unsqueeze(1), torch.finfo(scores.dtype).min).softmax(-1)
-            out = weights @ values  # (P,B,H,T,d)
+            out = scores.add_(bias.unsqueeze(1)).softmax(-1) @ values  # (P,B,H,T,d)
         return out.transpose(2, 3).flatten(3).flatten(1, 2)  # (P,B,H,T,d) -> (P,M,dim)
 
 
@@ -133,8 +132,10 @@ class MotionTeacher(nn.Module):
         h = torch.stack([embed(x[..., columns]) for embed, columns in zip(self.embed, self.columns)])  # (P,B,T,dim)
         positions = sinusoid(torch.arange(frames, device=x.device, dtype=torch.float32), self.cfg.dim)  # (T,dim)
         h = (h + positions.to(h.dtype)).flatten(1, 2)  # (P,B,T,dim) -> (P,M,dim)
+        # Finite, so that a padded frame that may look at nothing sees everything equally, which is not NaN.
+        bias = hidden.to(h.dtype) * torch.finfo(h.dtype).min
         for block in self.blocks:
-            h = block(h, hidden)
+            h = block(h, bias)
         h = self.narrow(h.mean(0)).unflatten(0, (batch, frames))  # (P,M,dim) -> (B,T,embed_dim)
         return self.norm(h + self.dropout(self.refine(F.gelu(h))))
 
