@@ -1,4 +1,4 @@
-"""Every size in one place: frozen dataclasses, and the presets toy, S, M, L and XL.
+"""Every size in one place: frozen dataclasses, and the presets toy, micro, S, M, L and XL.
 
 A configuration is plain data. It holds no tensor and knows no module, so a checkpoint can carry it as JSON
 (`Preset.to_dict`) and a reader can compare two models by comparing two dictionaries.
@@ -73,11 +73,20 @@ class DiTConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """How the two stages are trained; the defaults are the released recipe where it is known."""
+    """How the stages are trained; the defaults are the released recipe where it is known."""
 
     seed: int = 0
     bfloat16: bool = False  # autocast the forward pass; the weights and the optimiser stay float32
-    # stage 1: the VAE, on short crops
+    # stage 1: the evaluators
+    evaluator_steps: int = 20_000
+    evaluator_batch: int = 128
+    evaluator_lr: float = 1e-4
+    # stage 2: the teacher and the text encoder, by contrast
+    tmr_steps: int = 10_000
+    tmr_batch: int = 128
+    tmr_lr: float = 1e-4
+    tmr_warmup: int = 500
+    # stage 3: the VAE, on short crops
     vae_steps: int = 150_000
     vae_batch: int = 256
     vae_lr: float = 2e-4
@@ -85,14 +94,16 @@ class TrainConfig:
     crop_frames: int = 64
     kl_weight: float = 1e-4  # beta in front of an exact ELBO; see models/vae.py for the release's 8e-5
     root_weight: float = 0.05
-    # stage 2: the denoiser, on whole clips
+    align_weight: float = 0.1  # of the teacher's pull, relative to reconstruction's; 0: no alignment
+    matrix_of: str = "latent"  # Eq. 6 compares latents; "projected", as the release does, compares W z
+    # stage 4: the denoiser, on whole clips
     dit_steps: int = 150_000
     dit_batch: int = 64
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
     ema: float = 0.9999
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
-    # both
+    # all
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 1e-5
     grad_clip: float = 1.0
@@ -105,6 +116,7 @@ class Preset:
     name: str
     vae: VAEConfig = field(default_factory=VAEConfig)
     text: TextConfig = field(default_factory=TextConfig)
+    tmr: TMRConfig = field(default_factory=TMRConfig)
     dit: DiTConfig = field(default_factory=DiTConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
@@ -130,7 +142,7 @@ class Preset:
     def from_dict(cls, data: dict) -> "Preset":
         """The inverse of `to_dict`. ValueError: an unknown or missing key, named with where it stood."""
         _check_keys(cls, data, "preset")
-        parts = {"vae": VAEConfig, "text": TextConfig, "dit": DiTConfig, "train": TrainConfig}
+        parts = {"vae": VAEConfig, "text": TextConfig, "tmr": TMRConfig, "dit": DiTConfig, "train": TrainConfig}
         for key, part in parts.items():
             _check_keys(part, data[key], key)
         train = {**data["train"], "betas": tuple(data["train"]["betas"])}
@@ -138,6 +150,7 @@ class Preset:
             name=data["name"],
             vae=VAEConfig(**data["vae"]),
             text=TextConfig(**data["text"]),
+            tmr=TMRConfig(**data["tmr"]),
             dit=DiTConfig(**data["dit"]),
             train=TrainConfig(**train),
         )
@@ -164,10 +177,18 @@ PRESETS = {
     "toy": Preset(
         "toy",
         vae=VAEConfig(latent_dim=16, width=128, depth=2),
-        text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64, frozen=False),
+        text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64),
+        tmr=TMRConfig(dim=48, layers=2, heads=4, embed_dim=64, dropout=0.0),
         dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4, clock=True),
         train=TrainConfig(
             bfloat16=True,
+            evaluator_steps=1_500,
+            evaluator_batch=64,
+            evaluator_lr=2e-3,
+            tmr_steps=1_500,
+            tmr_batch=64,
+            tmr_lr=2e-3,
+            tmr_warmup=100,
             vae_steps=4_000,
             vae_batch=48,
             vae_lr=1.5e-3,
@@ -179,6 +200,33 @@ PRESETS = {
             dit_lr=1.5e-3,
             dit_warmup=300,
             ema=0.999,
+            weight_decay=0.0,
+        ),
+    ),
+    # For studies with seeds: a whole run in three minutes, on the teacher of another run.
+    "micro": Preset(
+        "micro",
+        vae=VAEConfig(latent_dim=16, width=64, depth=2),
+        text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64),
+        tmr=TMRConfig(dim=48, layers=2, heads=4, embed_dim=64, dropout=0.0),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=64, layers=4, heads=2, clock=True),
+        train=TrainConfig(
+            bfloat16=True,
+            tmr_steps=400,
+            tmr_batch=32,
+            tmr_lr=2e-3,
+            tmr_warmup=50,
+            vae_steps=600,
+            vae_batch=32,
+            vae_lr=2e-3,
+            vae_warmup=50,
+            kl_weight=1e-2,
+            root_weight=10.0,
+            dit_steps=1_500,
+            dit_batch=32,
+            dit_lr=3e-3,
+            dit_warmup=100,
+            ema=0.995,
             weight_decay=0.0,
         ),
     ),

@@ -160,6 +160,25 @@ class TextEncoder(nn.Module):
     forward = encode
 
 
+class WordCache:
+    """A frozen encoder that reads every sentence once, and keeps what it read in memory."""
+
+    def __init__(self, text: TextEncoder):
+        self.text = text.eval()
+        self.known: dict[str, Tensor] = {}  # sentence -> its words (S,E)
+
+    @torch.no_grad()
+    def encode(self, sentences: list[str]) -> Words:
+        """As `TextEncoder.encode`, without gradients."""
+        if new := [s for s in dict.fromkeys(sentences) if s not in self.known]:
+            read = self.text.encode(new)
+            self.known |= {s: e[m].clone() for s, e, m in zip(new, read.embeddings, read.mask)}
+        rows = [self.known[s] for s in sentences]
+        lengths = torch.tensor([len(row) for row in rows])
+        embeddings = nn.utils.rnn.pad_sequence(rows, batch_first=True)  # (B,S,E)
+        return Words(embeddings, torch.arange(embeddings.shape[1]) < lengths[:, None])
+
+
 def _vocabulary(counts: Counter, size: int) -> dict[str, int]:
     """Word pieces and their ids: special tokens, every letter (to spell any word), then the commonest words.
 

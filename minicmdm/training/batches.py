@@ -21,13 +21,21 @@ from minicmdm.models.vae import MACVAE
 WHOLE, SEGMENTS, CROPPED = 0, 1, 2  # the three ways to show a clip
 SHARES = (0.6, 0.2, 0.2)  # how often each is drawn
 SHORTEST_CROP = 4  # latents
+SEGMENT_SHARE = 0.3  # how often contrast is learnt from one segment rather than a whole clip
 LENGTH_DROP = 0.3  # how often a sample does not say how long its sentences last
 POOL = 8  # batches are cut from a pool of this many batches, sorted by length, so that little is padding
 
 
-def crop_features(data: MotionDataset, count: int, frames: int, generator: torch.Generator) -> Tensor:
+def crop_features(
+    data: MotionDataset,
+    count: int,
+    frames: int,
+    generator: torch.Generator,
+    guides: list[Tensor] | None = None,
+) -> tuple[Tensor, Tensor | None]:
     """Draw `count` normalised crops of one length (B,T,D): `frames` long or, for a share of the batches, as long as
-    the shortest clips, so that clips shorter than a crop are learnt too."""
+    the shortest clips, so that clips shorter than a crop are learnt too. `guides` holds something else for every frame
+    of every clip, (T,E) each; its crops (B,T,E) come second."""
     lengths = np.array([len(clip.features) for clip in data.clips])
     group = lengths >= frames
     if torch.rand((), generator=generator).item() >= group.mean():  # a batch of the short ones
@@ -35,9 +43,43 @@ def crop_features(data: MotionDataset, count: int, frames: int, generator: torch
         frames = int(lengths[group].min()) // 4 * 4
     members = np.flatnonzero(group)
     chosen = members[torch.randint(len(members), (count,), generator=generator).numpy()]
-    starts = torch.rand(count, generator=generator).numpy() * (lengths[chosen] - frames + 1)
-    crops = np.stack([data.clips[i].features[int(s) : int(s) + frames] for i, s in zip(chosen, starts)])
-    return torch.from_numpy((crops - data.mean) / data.std).float()
+    starts = (torch.rand(count, generator=generator).numpy() * (lengths[chosen] - frames + 1)).astype(int)
+    crops = np.stack([data.clips[i].features[s : s + frames] for i, s in zip(chosen, starts)])
+    x = torch.from_numpy((crops - data.mean) / data.std).float()
+    return x, None if guides is None else torch.stack([guides[i][s : s + frames] for i, s in zip(chosen, starts)])
+
+
+def draw_captioned(
+    data: MotionDataset, count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor, list[str], Tensor]:
+    """Draw `count` motions with a sentence each, for contrast: x (B,T,D) normalised, valid (B,T), sentences, same (B,B).
+
+    Mostly whole clips with one of their captions; in a share of the draws one labelled segment with its own sentence,
+    since the denoiser will be told segments too. `same` is True where two draws ask for the same.
+    """
+    pool = torch.randint(len(data.clips), (POOL * count,), generator=generator).tolist()
+    luck = torch.rand(POOL * count, 3, generator=generator).tolist()
+    draws = []  # (clip, first frame, end, sentence, what it asks for)
+    for i, (way, which, where) in zip(pool, luck):
+        clip = data.clips[i]
+        k = int(where * len(clip.labels))
+        start, end, sentence = clip.labels[k] if clip.labels else (0, len(clip.features), "")
+        if way < SEGMENT_SHARE and end - start >= 4 * SHORTEST_CROP:
+            asks = clip.program[k : k + 1] if clip.program else sentence
+        else:
+            start, end, sentence = 0, len(clip.features), clip.captions[int(which * len(clip.captions))]
+            asks = clip.program or sentence
+        draws.append((i, start, end, sentence, asks))
+    draws.sort(key=lambda draw: draw[2] - draw[1])
+    slot = int(torch.randint(POOL, (), generator=generator))
+    draws = draws[slot * count : (slot + 1) * count]
+    longest = max(end - start for _, start, end, _, _ in draws)
+    x, valid = np.zeros((count, longest, data.mean.shape[0]), np.float32), torch.zeros(count, longest, dtype=torch.bool)
+    for row, (i, start, end, _, _) in enumerate(draws):
+        x[row, : end - start] = (data.clips[i].features[start:end] - data.mean) / data.std
+        valid[row, : end - start] = True
+    same = torch.tensor([[a[4] == b[4] for b in draws] for a in draws])
+    return torch.from_numpy(x), valid, [draw[3] for draw in draws], same
 
 
 def latent_owners(clip: Clip, num_latents: int) -> np.ndarray:

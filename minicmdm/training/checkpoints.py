@@ -2,6 +2,7 @@
 
 A checkpoint is a folder:
 
+    tmr.safetensors     the teacher that aligned it; its text encoder is text/
     vae.safetensors     MAC-VAE (EMA weights)
     dit.safetensors     CausalDiT (EMA weights)
     text/               the text encoder: tokenizer.json, config.json, model.safetensors
@@ -30,10 +31,12 @@ from minicmdm.config import Preset
 from minicmdm.files import whole_file, write_text
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder
+from minicmdm.models.tmr import MotionTeacher
 from minicmdm.models.vae import MACVAE
 
 FORMAT = "minicmdm-checkpoint-1"
-WEIGHTS = ("vae.safetensors", "stats.safetensors", "dit.safetensors", "text/model.safetensors")
+WEIGHTS = ("vae.safetensors", "stats.safetensors", "dit.safetensors", "text/model.safetensors")  # what a motion takes
+FILES = (*WEIGHTS, "tmr.safetensors")
 STATS = ("feature_mean", "feature_std", "latent_mean", "latent_std")
 
 
@@ -77,9 +80,12 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], object]:
     return tensors, note
 
 
-def load_weights(module: nn.Module, path: str | Path) -> None:
-    """Load a weight file into a module whose names and shapes must match exactly; teach the first difference."""
-    tensors, _ = load_tensors(path)
+def load_weights(module: nn.Module, path: str | Path, more: Mapping[str, Tensor] | None = None) -> None:
+    """Load a weight file into a module whose names and shapes must match exactly; teach the first difference.
+
+    `more` holds those of the module's tensors that live elsewhere.
+    """
+    tensors = {**load_tensors(path)[0], **(more or {})}
     own = module.state_dict()
     for key in own.keys() | tensors.keys():
         if key not in tensors or key not in own:
@@ -106,10 +112,16 @@ def save_vae(folder: Path, vae: MACVAE, stats: Mapping[str, Tensor]) -> None:
     save_tensors(folder / "stats.safetensors", stats)
 
 
-def save_denoiser(folder: Path, dit: CausalDiT, text: TextEncoder) -> None:
-    """Write the second stage's part: the DiT and the text encoder."""
+def save_teacher(folder: Path, teacher: MotionTeacher) -> None:
+    """Write the teacher's own weights and, beside them, its text encoder, which the denoiser will read with."""
+    own = {key: value for key, value in teacher.state_dict().items() if not key.startswith("text.")}
+    save_tensors(folder / "tmr.safetensors", own)
+    save_text(folder, teacher.text)
+
+
+def save_dit(folder: Path, dit: CausalDiT) -> None:
+    """Write the last stage's part: the denoiser."""
     save_tensors(folder / "dit.safetensors", dit.state_dict())
-    save_text(folder, text)
 
 
 def save_text(folder: Path, text: TextEncoder) -> None:
@@ -124,7 +136,7 @@ def save_text(folder: Path, text: TextEncoder) -> None:
 
 def write_card(folder: Path, preset: Preset, facts: Mapping[str, object]) -> None:
     """Write the card last: what the weights are, how they were made, and the checksum of every weight file."""
-    files = {name: checksum(folder / name) for name in WEIGHTS if (folder / name).is_file()}
+    files = {name: checksum(folder / name) for name in FILES if (folder / name).is_file()}
     card = {"format": FORMAT, "preset": preset.to_dict(), **facts, "files": files}
     write_text(folder / "card.json", json.dumps(card, indent=2) + "\n")
 
@@ -152,8 +164,8 @@ def read_card(folder: str | Path) -> dict:
             f"{path} is not the card of a minicmdm checkpoint: format {FORMAT!r} expected, {found!r} found"
         )
     files = card.get("files")
-    if not isinstance(files, dict) or not set(files) <= set(WEIGHTS):
-        raise ValueError(f"{path} must name the checksums of the files {', '.join(WEIGHTS)} under 'files'")
+    if not isinstance(files, dict) or not set(files) <= set(FILES):
+        raise ValueError(f"{path} must name the checksums of the files {', '.join(FILES)} under 'files'")
     for name, expected in files.items():
         if not (folder / name).is_file():
             raise FileNotFoundError(f"the checkpoint {folder} lacks {name}, which its card names")
@@ -193,6 +205,18 @@ def load_vae(folder: Path, preset: Preset) -> tuple[MACVAE, dict[str, Tensor]]:
         if name.endswith("std") and not (value > 0).all():
             raise ValueError(f"{folder / 'stats.safetensors'}: {name} must be positive")
     return vae.eval(), stats
+
+
+def load_teacher(folder: Path, preset: Preset) -> MotionTeacher:
+    """Load the teacher in eval mode, with the text encoder it was trained with. It learns no more."""
+    text = TextEncoder.load(folder / "text", preset.text)
+    try:
+        teacher = MotionTeacher(preset.tmr, text)
+    except ValueError as error:
+        raise ValueError(f"{folder / 'card.json'} describes a teacher that cannot be built: {error}") from error
+    words = {f"text.{key}": value for key, value in text.state_dict().items()}
+    load_weights(teacher, folder / "tmr.safetensors", words)
+    return teacher.eval().requires_grad_(False)
 
 
 def _build(model: type[nn.Module], config: object, folder: Path) -> nn.Module:

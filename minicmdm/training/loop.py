@@ -23,6 +23,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from minicmdm.config import Preset
 from minicmdm.files import whole_file
 from minicmdm.training.checkpoints import load_tensors, save_tensors
 
@@ -42,6 +43,24 @@ class LoopConfig:
     log_every: int = 20
     validate_every: int = 500
     save_every: int = 500
+
+
+def loop_config(plan: Preset, steps: int, lr: float, warmup: int) -> LoopConfig:
+    """A stage's loop: what differs between the stages is given, the rest is the plan's."""
+    cfg, every = plan.train, max(1, min(500, steps // 4))
+    return LoopConfig(
+        steps=steps,
+        lr=lr,
+        warmup=warmup,
+        betas=cfg.betas,
+        weight_decay=cfg.weight_decay,
+        grad_clip=cfg.grad_clip,
+        ema=cfg.ema,
+        seed=cfg.seed,
+        log_every=max(1, min(20, steps // 4)),
+        validate_every=every,
+        save_every=every,
+    )
 
 
 @dataclass

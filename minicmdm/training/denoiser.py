@@ -1,0 +1,70 @@
+"""The last stage: diffusion forcing on cached latents, with the teacher's text encoder frozen (CMDM Alg. 1)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from minicmdm.config import Preset
+from minicmdm.data.dataset import MotionDataset
+from minicmdm.diffusion.forcing import diffusion_forcing_loss
+from minicmdm.models.dit import CausalDiT
+from minicmdm.models.text import TextEncoder, WordCache
+from minicmdm.training import checkpoints
+from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, words_per_latent
+from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
+
+
+def train_dit(
+    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+) -> LoopResult:
+    """Learn the denoiser: clips are encoded once, sentences once each, and every latent gets its own noise level."""
+    cfg = plan.train
+    vae, stats = checkpoints.load_vae(out, plan)
+    shift_scale = stats["latent_mean"], stats["latent_std"]
+    latents = encode_dataset(vae, train_set, shift_scale)
+    val_latents = encode_dataset(vae, val_set, shift_scale)
+    words = WordCache(TextEncoder.load(out / "text", plan.text))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(step_key(cfg.seed, -2))
+        models = nn.ModuleDict({"dit": CausalDiT(plan.dit)})
+
+    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        return denoising_loss(models["dit"], words, latents, plan, cfg.dit_batch, cfg.text_drop, generator), {}
+
+    @torch.no_grad()
+    def validate(ema: nn.ModuleDict) -> dict[str, float]:
+        losses = []
+        for key in range(4):  # the same batches and the same noise every time
+            generator = torch.Generator().manual_seed(key)
+            losses.append(denoising_loss(ema["dit"], words, val_latents, plan, 64, 0.0, generator).item())
+        return {"val_loss": float(np.mean(losses))}
+
+    config = loop_config(plan, cfg.dit_steps, cfg.dit_lr, cfg.dit_warmup)
+    identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
+    for name in ("vae.safetensors", "text/model.safetensors"):
+        identity[name] = checkpoints.checksum(out / name)
+    result = fit("dit", models, loss, validate, config, out, identity=identity, resume=resume, progress=progress)
+    checkpoints.save_dit(out, result.ema["dit"])
+    return result
+
+
+def denoising_loss(
+    dit: CausalDiT,
+    words: WordCache,
+    latents: LatentSet,
+    plan: Preset,
+    count: int,
+    drop: float,
+    generator: torch.Generator,
+) -> Tensor:
+    """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent."""
+    batch = draw_batch(latents, count, drop, generator)
+    seen, mask = words_per_latent(words.encode(batch.sentences), batch.choice, batch.owner)  # (B,S,E), (B,N,S)
+    with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
+        return diffusion_forcing_loss(
+            dit, batch.z, seen, mask, batch.valid, plan.dit.block_size, generator, batch.clock
+        )
