@@ -16,7 +16,8 @@ import numpy as np
 from minicmdm.data.dataset import Clip, toy_dataset, world_fingerprint
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
-from minicmdm.data.programs import FIELDS, Program, score
+from minicmdm.data.programs import Program
+from minicmdm.evaluation.metrics import clip_accuracy, field_accuracy, segment_accuracy
 
 if TYPE_CHECKING:
     from minicmdm.pipeline import MotionPipeline
@@ -110,28 +111,6 @@ def evaluate_quick(
         "fingerprint": world_fingerprint(),
         "seconds": round(time.perf_counter() - start, 1),
     }
-
-
-def segment_accuracy(asked: list[Program], found: list[Program]) -> float:
-    """Right segments / max(asked, found), summed over clips."""
-    pairs = [score(a, f) for a, f in zip(asked, found)]
-    return sum(right for right, _ in pairs) / max(sum(of for _, of in pairs), 1)
-
-
-def clip_accuracy(asked: list[Program], found: list[Program]) -> float:
-    """Share of clips in which every segment is right and none is too many."""
-    return float(np.mean([right == of for right, of in (score(a, f) for a, f in zip(asked, found))] or [0.0]))
-
-
-def field_accuracy(asked: list[Program], found: list[Program]) -> dict[str, float]:
-    """Share of stated fields that are right, segment by segment in its place; fields nobody stated are left out."""
-    hits: dict[str, list[bool]] = {name: [] for name in FIELDS}
-    for a, f in zip(asked, found):
-        for k, segment in enumerate(a):
-            for name in FIELDS:
-                if getattr(segment, name) is not None:
-                    hits[name].append(k < len(f) and getattr(f[k], name) == getattr(segment, name))
-    return {name: float(np.mean(values)) for name, values in hits.items() if values}
 
 
 def nearest_words(clips: list[Clip], train: list[Clip]) -> list[Program]:
