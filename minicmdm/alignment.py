@@ -69,7 +69,7 @@ def adaptive_weight(rec: Tensor, align: Tensor, weight: Tensor, clamp: float = 1
     are kept for the backward pass. rec and align are scalars without weights of their own -> scalar.
     """
     rec_norm, align_norm = (torch.autograd.grad(loss, weight, retain_graph=True)[0].norm() for loss in (rec, align))
-    return (rec_norm / align_norm.clamp(min=1e-4)).clamp(0.0, clamp).detach()
+    return (rec_norm / align_norm.clamp(min=1e-4)).clamp(0.0, clamp)
 
 
 def _cosines(x: Tensor) -> Tensor:
