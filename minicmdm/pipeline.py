@@ -61,7 +61,8 @@ class MotionPipeline:
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         checkpoints.save_vae(folder, self.vae, self.stats)
-        checkpoints.save_denoiser(folder, self.dit, self.text)
+        checkpoints.save_dit(folder, self.dit)
+        checkpoints.save_text(folder, self.text)
         facts = {key: value for key, value in self.card.items() if key not in ("format", "preset", "files")}
         checkpoints.write_card(folder, self.preset, facts)
         return folder
@@ -77,11 +78,14 @@ class MotionPipeline:
         guidance_scale: float = 3.0,
         block_size: int | None = None,
         seed: int | Sequence[int] = 0,
+        tell_length: bool = True,
     ) -> Motion | list[Motion]:
         """Generate a Motion for a prompt, or a list of them for a list of prompts.
 
         `num_frames` (4..196 at 20 fps) and `seed` are one for all or one for each. `schedule` is "fss", "full" or
         "autoregressive", with K = `num_steps` and L = `uncertainty`; `block_size` is the model's own unless given.
+        With `tell_length` a model that has a clock knows how long the motion is to be, and paces itself; without, a
+        longer motion begins exactly like a shorter one.
         Raises ValueError for anything that cannot be asked.
         """
         single = isinstance(prompt, str)
@@ -103,7 +107,7 @@ class MotionPipeline:
             noise = torch.stack([self._noise(seeds[i], max(counts)) for i in chosen])  # (B,N,C)
             valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]  # (B,N)
             matrix = schedule_matrix(max(counts), num_steps, uncertainty, block_size, schedule)
-            features = self._generate([prompts[i] for i in chosen], noise, valid, matrix, scale)  # (B,T,D)
+            features = self._generate([prompts[i] for i in chosen], noise, valid, matrix, scale, tell_length)  # (B,T,D)
             for i, one in zip(chosen, features):
                 one = one[: frames[i]].copy()
                 joints = features_to_joints(one).astype(np.float32)  # (T,22,3)
@@ -112,7 +116,7 @@ class MotionPipeline:
 
     @torch.no_grad()
     def _generate(
-        self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float
+        self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float, tell_length: bool
     ) -> np.ndarray:
         batch, num_latents, _ = noise.shape
         words = self.text.encode(prompts)  # (B,S,E), (B,S)
@@ -121,7 +125,8 @@ class MotionPipeline:
         null_mask = null.mask[:, None, :].expand(batch, num_latents, -1)
         null_words = null.embeddings.expand(batch, -1, -1)
         place = torch.arange(num_latents, dtype=torch.float32).expand(batch, -1)
-        clock = torch.stack([place, valid.sum(1, keepdim=True) - 1 - place], dim=-1)  # (B,N,2): all is one sentence
+        left = valid.sum(1, keepdim=True) - 1 - place if tell_length else torch.full_like(place, -1.0)
+        clock = torch.stack([place, left], dim=-1)  # (B,N,2): all is one sentence
         denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid, clock)
         latents = sample(denoise, matrix, noise)  # (B,N,C)
         return self.decode(latents).numpy()

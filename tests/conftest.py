@@ -12,7 +12,7 @@ import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 import torch  # noqa: E402
 
-from minicmdm.config import DiTConfig, Preset, TextConfig, TrainConfig, VAEConfig  # noqa: E402
+from minicmdm.config import DiTConfig, Preset, TextConfig, TMRConfig, TrainConfig, VAEConfig  # noqa: E402
 from minicmdm.data.dataset import Clip, MotionDataset  # noqa: E402
 
 torch.set_num_threads(1)
@@ -39,12 +39,14 @@ def make_fake_data(count: int = 12, seed: int = 0) -> MotionDataset:
 def make_tiny_preset(**train) -> Preset:
     """A preset that trains in a second."""
     steps = dict(vae_steps=12, vae_batch=4, vae_lr=1e-3, vae_warmup=2, crop_frames=32)
+    steps |= dict(tmr_steps=12, tmr_batch=4, tmr_lr=1e-3, tmr_warmup=2)
     steps |= dict(dit_steps=12, dit_batch=4, dit_lr=1e-3, dit_warmup=2, ema=0.9)
     return Preset(
         "tiny",
         VAEConfig(latent_dim=4, width=16, depth=1),
-        TextConfig(dim=16, layers=1, heads=2, vocab_size=100, max_words=24, frozen=False),
-        DiTConfig(latent_dim=4, text_dim=16, dim=16, layers=2, heads=2, time_dim=16),
+        TextConfig(dim=16, layers=1, heads=2, vocab_size=100, max_words=24),
+        TMRConfig(dim=16, layers=1, heads=2, embed_dim=8, dropout=0.0),
+        DiTConfig(latent_dim=4, text_dim=16, dim=16, layers=2, heads=2, time_dim=16, clock=True),
         replace(TrainConfig(), **(steps | train)),
     )
 
@@ -62,7 +64,7 @@ def tiny_preset() -> Preset:
 
 @pytest.fixture(scope="session")
 def tiny_run(tmp_path_factory, fake_data, tiny_preset):
-    """The folder of one whole training run, both stages; tests that change files work on a copy."""
+    """The folder of one whole training run, every stage; tests that change files work on a copy."""
     from minicmdm.training import stages
 
     folder = tmp_path_factory.mktemp("run") / "tiny"

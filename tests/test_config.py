@@ -35,7 +35,7 @@ def test_json_round_trip(name):
 
 
 def test_unknown_preset_lists_the_known_ones():
-    with pytest.raises(ValueError, match="toy, S, M, L, XL"):
+    with pytest.raises(ValueError, match="toy, micro, S, M, L, XL"):
         preset("tiny")
 
 

@@ -14,9 +14,10 @@ from conftest import make_fake_data
 from torch import nn
 
 from minicmdm.data.features import features_to_joints
-from minicmdm.models.text import Words
-from minicmdm.models.vae import MACVAE
-from minicmdm.training import batches, checkpoints, stages
+from minicmdm.models.dit import CausalDiT
+from minicmdm.models.text import WordCache, Words
+from minicmdm.models.vae import MACVAE, vae_loss
+from minicmdm.training import batches, checkpoints, denoiser, representation, stages
 from minicmdm.training.loop import LoopConfig, fit, learning_rate, step_key
 
 
@@ -45,7 +46,7 @@ def generator(seed=0):
 
 def test_crops_are_pieces_of_clips(fake_data):
     for seed in range(20):
-        crops = batches.crop_features(fake_data, 5, 64, generator(seed)).numpy() * fake_data.std + fake_data.mean
+        crops = batches.crop_features(fake_data, 5, 64, generator(seed))[0].numpy() * fake_data.std + fake_data.mean
         assert crops.shape[1] == 64 or 40 <= crops.shape[1] < 64  # short clips come in batches of their own
         for crop in crops:
             homes = [
@@ -55,7 +56,7 @@ def test_crops_are_pieces_of_clips(fake_data):
                 if np.allclose(clip.features[start : start + len(crop)], crop, atol=1e-5)
             ]
             assert homes
-    lengths = {batches.crop_features(fake_data, 2, 64, generator(seed)).shape[1] for seed in range(40)}
+    lengths = {batches.crop_features(fake_data, 2, 64, generator(seed))[0].shape[1] for seed in range(40)}
     assert 64 in lengths and len(lengths) > 1
 
 
@@ -156,12 +157,12 @@ def test_step_keys_do_not_collide():
 
 def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
     torch.manual_seed(0)
-    vae, x = MACVAE(tiny_preset.vae), batches.crop_features(fake_data, 8, 32, generator())
-    text = stages.TextEncoder.from_captions([c for clip in fake_data.clips for c in clip.captions], tiny_preset.text)
-    pair = nn.ModuleDict({"text": text, "dit": stages.CausalDiT(tiny_preset.dit)})
+    vae, x = MACVAE(tiny_preset.vae), batches.crop_features(fake_data, 8, 32, generator())[0]
+    words = WordCache(representation.new_text_encoder(tiny_preset, fake_data), batches.said(fake_data))
+    dit = CausalDiT(tiny_preset.dit)
     cases = {
-        "vae": (vae, lambda: stages.vae_loss(vae(x, generator()), x, tiny_preset.train).recon),
-        "dit": (pair, lambda: stages.denoising_loss(pair, latents, tiny_preset, 8, 0.0, generator())),
+        "vae": (vae, lambda: vae_loss(vae(x, generator()), x, tiny_preset.train).recon),
+        "dit": (dit, lambda: denoiser.denoising_loss(dit, words, latents, tiny_preset, 8, 0.0, generator())),
     }
     for model, loss in cases.values():
         optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
@@ -177,10 +178,10 @@ def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
 def test_mpjpe_is_in_millimetres_and_blind_to_the_pelvis(fake_data):
     joints = features_to_joints(fake_data.clips[0].features)
     moved = joints + [3.0, 0.0, -2.0]
-    assert stages.pelvis_distance(joints, moved).max() < 1e-6
+    assert representation.pelvis_distance(joints, moved).max() < 1e-6
     one_off = joints.copy()
     one_off[:, 5, 1] += 0.022
-    np.testing.assert_allclose(stages.pelvis_distance(joints, one_off), 0.001, atol=1e-9)
+    np.testing.assert_allclose(representation.pelvis_distance(joints, one_off), 0.001, atol=1e-9)
 
     class Perfect(nn.Module):
         def encode(self, x):
@@ -189,10 +190,10 @@ def test_mpjpe_is_in_millimetres_and_blind_to_the_pelvis(fake_data):
         def decode(self, z):
             return z
 
-    assert stages.reconstruction_mpjpe(Perfect(), fake_data, fake_data, count=2) < 1e-2
+    assert representation.reconstruction_mpjpe(Perfect(), fake_data, fake_data, count=2) < 1e-2
 
 
-def same_weights(one, other, names=checkpoints.WEIGHTS):
+def same_weights(one, other, names=checkpoints.FILES):
     return all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
@@ -216,13 +217,18 @@ def die_after(monkeypatch, module, name, calls):
 def test_resumed_run_equals_the_unbroken_one(tiny_run, tiny_preset, tiny_world, tmp_path):
     tiny_world(tiny_preset)
     out = tmp_path / "broken"
-    for function, calls in (("crop_features", 7), ("denoising_loss", 17)):  # in mid-VAE, then in mid-DiT
+    # In mid-teacher, mid-VAE, mid-DiT.
+    for module, function, calls in (
+        (representation, "draw_captioned", 7),
+        (representation, "crop_features", 7),
+        (denoiser, "denoising_loss", 17),
+    ):
         with pytest.MonkeyPatch.context() as patch, pytest.raises(Killed):
-            die_after(patch, stages, function, calls)
+            die_after(patch, module, function, calls)
             stages.train("tiny", out, resume=True, progress=False)
     stages.train("tiny", out, resume=True, progress=False)
     assert same_weights(tiny_run, out)
-    for name in ("losses_vae.csv", "losses_dit.csv"):
+    for name in ("losses_tmr.csv", "losses_vae.csv", "losses_dit.csv"):
         assert (tiny_run / name).read_text() == (out / name).read_text()
     before = (out / "dit.safetensors").read_bytes()
     stages.train("tiny", out, resume=True, progress=False)  # nothing left to do
@@ -232,20 +238,23 @@ def test_resumed_run_equals_the_unbroken_one(tiny_run, tiny_preset, tiny_world, 
 def test_stage_by_stage_equals_all(tiny_run, tiny_preset, tiny_world, tmp_path):
     tiny_world(tiny_preset)
     out = tmp_path / "two"
-    with pytest.raises(FileNotFoundError, match="needs stage vae"):
+    with pytest.raises(FileNotFoundError, match="stage dit needs the stages before it"):
         stages.train("tiny", out, stage="dit", progress=False)
+    with pytest.raises(FileNotFoundError, match="tmr.safetensors"):
+        stages.train("tiny", out, stage="vae", progress=False)
+    stages.train("tiny", out, stage="tmr", progress=False)
     stages.train("tiny", out, stage="vae", progress=False)
     with pytest.raises(ValueError, match="stage dit"):
         checkpoints.load_checkpoint(out)
     stages.train("tiny", out, stage="dit", progress=False)
     assert same_weights(tiny_run, out)
-    assert checkpoints.load_checkpoint(out).card["metrics"].keys() == {"mpjpe_mm", "val_loss"}
+    assert checkpoints.load_checkpoint(out).card["metrics"].keys() == {"val_r_at_1", "mpjpe_mm", "val_loss"}
 
 
 def test_another_seed_is_another_model(tiny_run, tiny_preset, tiny_world, tmp_path):
     tiny_world(tiny_preset)
-    stages.train("tiny", tmp_path / "a", stage="vae", seed=1, progress=False)
-    assert not same_weights(tiny_run, tmp_path / "a", ["vae.safetensors"])
+    stages.train("tiny", tmp_path / "a", stage="tmr", seed=1, progress=False)
+    assert not same_weights(tiny_run, tmp_path / "a", ["tmr.safetensors"])
 
 
 def test_runs_are_not_mixed(tiny_run, tiny_preset, tiny_world):

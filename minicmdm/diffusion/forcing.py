@@ -10,7 +10,6 @@ from torch import Tensor
 
 from minicmdm.diffusion.path import interpolate, velocity
 
-
 LEVELS = 64  # different times in one batch
 
 

@@ -90,8 +90,9 @@ def guided(
     """Bind the text to a model: a denoiser that returns v = v_null + s (v_text - v_null).
 
     words (B,S,E) and mask (B,N,S) are the sentence's, null_words (B,S',E) and null_mask (B,N,S') those of
-    "". Both branches run in one batch of 2B. A scale of 1 is the plain conditional model, and 0 the
-    unconditional one; each runs one branch. valid (B,N) and clock (B,N,2) are the model's own. ValueError: a scale that is not a finite number.
+    "". valid (B,N) and clock (B,N,2) are the model's own. Both branches run in one batch of 2B. A scale of 1 is the
+    plain conditional model, and 0 the unconditional one; each runs one branch. ValueError: a scale that is not a
+    finite number.
     """
     if not np.isfinite(guidance_scale):
         raise ValueError(f"guidance_scale must be a finite number, got {guidance_scale!r}")

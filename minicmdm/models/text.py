@@ -15,6 +15,7 @@ Nothing here can reach the network: a folder holds `tokenizer.json`, `config.jso
 import json
 import string
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
@@ -161,18 +162,29 @@ class TextEncoder(nn.Module):
 
 
 class WordCache:
-    """A frozen encoder that reads every sentence once, and keeps what it read in memory."""
+    """A frozen encoder that reads every sentence once, and keeps in memory what it read.
 
-    def __init__(self, text: TextEncoder):
+    The sentences are read at the start, sorted, in groups of one size: what a sentence's words come out as then depends
+    on the list alone (padding moves the last digits), and a resumed training sees the very same numbers.
+    """
+
+    def __init__(self, text: TextEncoder, sentences: Iterable[str], group: int = 256):
         self.text = text.eval()
         self.known: dict[str, Tensor] = {}  # sentence -> its words (S,E)
+        ordered = sorted(set(sentences), key=lambda s: (len(s), s))
+        for first in range(0, len(ordered), group):
+            self._read(ordered[first : first + group])
 
     @torch.no_grad()
+    def _read(self, sentences: list[str]) -> None:
+        read = self.text.encode(sentences)
+        self.known |= {s: e[m].clone() for s, e, m in zip(sentences, read.embeddings, read.mask)}
+
     def encode(self, sentences: list[str]) -> Words:
-        """As `TextEncoder.encode`, without gradients."""
-        if new := [s for s in dict.fromkeys(sentences) if s not in self.known]:
-            read = self.text.encode(new)
-            self.known |= {s: e[m].clone() for s, e, m in zip(new, read.embeddings, read.mask)}
+        """As `TextEncoder.encode`, without gradients; a sentence that is new is read by itself."""
+        for sentence in sentences:
+            if sentence not in self.known:
+                self._read([sentence])
         rows = [self.known[s] for s in sentences]
         lengths = torch.tensor([len(row) for row in rows])
         embeddings = nn.utils.rnn.pad_sequence(rows, batch_first=True)  # (B,S,E)

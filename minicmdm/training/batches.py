@@ -52,7 +52,7 @@ def crop_features(
 def draw_captioned(
     data: MotionDataset, count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor, list[str], Tensor]:
-    """Draw `count` motions with a sentence each, for contrast: x (B,T,D) normalised, valid (B,T), sentences, same (B,B).
+    """Draw `count` motions with a sentence each: x (B,T,D) normalised, valid (B,T), sentences, same (B,B).
 
     Mostly whole clips with one of their captions; in a share of the draws one labelled segment with its own sentence,
     since the denoiser will be told segments too. `same` is True where two draws ask for the same.
@@ -80,6 +80,12 @@ def draw_captioned(
         valid[row, : end - start] = True
     same = torch.tensor([[a[4] == b[4] for b in draws] for a in draws])
     return torch.from_numpy(x), valid, [draw[3] for draw in draws], same
+
+
+def said(data: MotionDataset) -> set[str]:
+    """Every sentence of a data set: captions of clips and of their segments."""
+    captions = {caption for clip in data.clips for caption in clip.captions}
+    return captions | {sentence for clip in data.clips for _, _, sentence in clip.labels}
 
 
 def latent_owners(clip: Clip, num_latents: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from minicmdm.diffusion.forcing import diffusion_forcing_loss
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder, WordCache
 from minicmdm.training import checkpoints
-from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, words_per_latent
+from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, said, words_per_latent
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
 
 
@@ -27,7 +27,7 @@ def train_dit(
     shift_scale = stats["latent_mean"], stats["latent_std"]
     latents = encode_dataset(vae, train_set, shift_scale)
     val_latents = encode_dataset(vae, val_set, shift_scale)
-    words = WordCache(TextEncoder.load(out / "text", plan.text))
+    words = WordCache(TextEncoder.load(out / "text", plan.text), {"", *said(train_set), *said(val_set)})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_key(cfg.seed, -2))
         models = nn.ModuleDict({"dit": CausalDiT(plan.dit)})

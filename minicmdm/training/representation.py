@@ -1,9 +1,10 @@
-"""What the denoiser stands on: the teacher with its text encoder (stage "tmr"), and the VAE that it aligns (stage "vae").
+"""What the denoiser stands on: the teacher with its text encoder (stage "tmr"), and the VAE it aligns (stage "vae").
 
     captions + features --contrast--> Part-TMR: frame features and word vectors that mean the same thing
     features --crops--> MAC-VAE, whose latents are pulled towards the teacher's frames (CMDM Eqs 2-6)
 
-Both write what comes after them needs: the text encoder, frozen from here on, and the statistics of features and latents.
+Both write what comes after them needs: the text encoder, frozen from here on, and the statistics of features and
+latents.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from minicmdm.models.text import TextEncoder
 from minicmdm.models.tmr import MotionTeacher, contrastive_loss
 from minicmdm.models.vae import MACVAE, vae_loss
 from minicmdm.training import checkpoints
-from minicmdm.training.batches import crop_features, draw_captioned, encode_dataset
+from minicmdm.training.batches import crop_features, draw_captioned, encode_dataset, said
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
 
 
@@ -65,9 +66,7 @@ def new_text_encoder(plan: Preset, train_set: MotionDataset, folder: Path | None
     cfg = replace(plan.text, frozen=False)
     if folder is not None or plan.text.path is not None:
         return TextEncoder.load(folder or plan.text.path, cfg)
-    captions = {caption for clip in train_set.clips for caption in clip.captions}
-    captions |= {sentence for clip in train_set.clips for _, _, sentence in clip.labels}
-    return TextEncoder.from_captions(sorted(captions), cfg)
+    return TextEncoder.from_captions(sorted(said(train_set)), cfg)
 
 
 @torch.no_grad()
@@ -160,9 +159,9 @@ def reconstruction_mpjpe(
     `train_set` gives the normalisation. The mean is over all frames and joints of the first `count` clips.
     """
     mean, std = torch.from_numpy(train_set.mean), torch.from_numpy(train_set.std)
-    group, total, frames = vae.cfg.frames_per_latent, 0.0, 0
+    total, frames = 0.0, 0
     for clip in val_set.clips[:count]:
-        length = len(clip.features) // group * group
+        length = len(clip.features) // 4 * 4
         x = torch.from_numpy(clip.features[:length])
         recon = vae.decode(vae.encode(((x - mean) / std)[None])[0])[0] * std + mean  # (T,D)
         truth, guess = features_to_joints(clip.features[:length]), features_to_joints(recon.numpy())  # (T,22,3)

@@ -44,7 +44,7 @@ def train(
     command: str = "",
     say: Say = lambda line: None,
 ) -> Path:
-    """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out` (made if missing); return it.
+    """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
