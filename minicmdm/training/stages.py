@@ -20,14 +20,16 @@ import torch
 import minicmdm
 from minicmdm.config import Preset, preset
 from minicmdm.data.dataset import MotionDataset, cached_toy_folder, load_dataset, toy_dataset
+from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
 from minicmdm.training.representation import train_teacher, train_vae
 
-RUN = {"tmr": train_teacher, "vae": train_vae, "dit": train_dit}
-NEEDS = {"tmr": (), "vae": ("tmr.safetensors",), "dit": ("vae.safetensors", "text/model.safetensors")}
+RUN = {"evaluator": train_bench, "tmr": train_teacher, "vae": train_vae, "dit": train_dit}
+NEEDS = {"evaluator": (), "tmr": (), "vae": ("tmr.safetensors",), "dit": ("vae.safetensors", "text/model.safetensors")}
 STAGES = (*RUN, "all")
-FAST = {f"{name}_steps": 30 for name in RUN} | {f"{name}_batch": 8 for name in RUN} | {f"{n}_warmup": 5 for n in RUN}
+FAST = {f"{name}_steps": 30 for name in RUN} | {f"{name}_batch": 8 for name in RUN}
+FAST |= {f"{name}_warmup": 5 for name in RUN if name != "evaluator"}
 Say = Callable[[str], None]
 
 

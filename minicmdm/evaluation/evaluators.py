@@ -1,0 +1,248 @@
+"""The judges: small frozen networks that put motions and sentences in one space, where metrics measure distances.
+
+    "t2m"   two strided convolutions -> BiGRU | word vectors -> BiGRU                  close: by Euclidean distance
+    "clip"  groups of four frames -> transformer | word vectors -> transformer         close: by cosine
+
+Both are the field's kinds (T2M's, and MARDM's after MotionCLIP), made small. No model is graded by its own tutor: they
+share neither weights nor words nor architecture nor order of data with the teacher that aligns the VAE.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.nn.utils.rnn import pack_padded_sequence, pad_sequence
+
+from minicmdm.config import Preset
+from minicmdm.data.dataset import MotionDataset
+from minicmdm.data.features import NUM_FEATURES
+from minicmdm.evaluation.metrics import r_precision
+from minicmdm.files import write_text
+from minicmdm.models.layers import sinusoid
+from minicmdm.models.tmr import MAX_SCALE, contrastive_loss
+from minicmdm.training.batches import draw_captioned
+from minicmdm.training.checkpoints import checksum, load_tensors, load_weights, save_tensors
+from minicmdm.training.loop import LoopConfig, LoopResult, fit, step_key
+
+FORMAT = "minicmdm-bench-1"
+ESSENTIAL = 67  # root and joint positions, the first of the 263: all that a skeleton is drawn from (MARDM)
+GROUP, SLOPE = 4, 0.2  # frames a token; LeakyReLU's, as in T2M
+UNKNOWN = 0  # place of every word outside the vocabulary; the padding, never read, is the same
+LAYERS, HEADS, DROPOUT = 2, 4, 0.1  # of the transformers; of both kinds
+WORD = re.compile(r"\w+")  # what stands between spaces and punctuation
+FORGET = 0.05  # how often a word is hidden in training, so that the unknown one means "some word"
+
+
+@dataclass(frozen=True)
+class EvaluatorConfig:
+    """One judge's shape."""
+
+    kind: str = "t2m"  # "t2m" or "clip"
+    dims: int = NUM_FEATURES  # how many features it reads, from the first: 263 or 67
+    width: int = 112
+    embed_dim: int = 64  # few, since FID between two draws of the same motions grows with them
+
+
+BENCH = {  # the three judges of toy-bench-1
+    "t2m": EvaluatorConfig("t2m"),
+    "t2m_essential": EvaluatorConfig("t2m", ESSENTIAL),
+    "clip_essential": EvaluatorConfig("clip", ESSENTIAL, width=96),
+}
+
+
+class GRUReader(nn.Module):
+    """A BiGRU with learnt first states reads x (B,N,width) up to `lengths` (B,); its last states -> (B,embed_dim)."""
+
+    def __init__(self, cfg: EvaluatorConfig):
+        super().__init__()
+        self.start = nn.Parameter(0.1 * torch.randn(2, 1, cfg.width // 2))
+        self.gru = nn.GRU(cfg.width, cfg.width // 2, batch_first=True, bidirectional=True)
+        inner = nn.Linear(cfg.width, cfg.width), nn.LayerNorm(cfg.width), nn.LeakyReLU(SLOPE)
+        self.head = nn.Sequential(*inner, nn.Linear(cfg.width, cfg.embed_dim))
+
+    def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
+        packed = pack_padded_sequence(x, lengths.cpu(), batch_first=True, enforce_sorted=False)
+        _, last = self.gru(packed, self.start.expand(-1, len(x), -1).contiguous())  # (2,B,width/2)
+        return self.head(torch.cat([last[0], last[1]], dim=-1))
+
+
+class TransformerReader(nn.Module):
+    """A class token reads x (B,N,width) up to `lengths` (B,) through a transformer -> (B,embed_dim) of length 1."""
+
+    def __init__(self, cfg: EvaluatorConfig):
+        super().__init__()
+        sizes = cfg.width, HEADS, 2 * cfg.width, DROPOUT
+        layer = nn.TransformerEncoderLayer(*sizes, F.gelu, batch_first=True, norm_first=True)
+        self.token = nn.Parameter(0.1 * torch.randn(1, 1, cfg.width))
+        self.layers = nn.TransformerEncoder(layer, LAYERS, nn.LayerNorm(cfg.width), enable_nested_tensor=False)
+        self.head = nn.Linear(cfg.width, cfg.embed_dim)
+
+    def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
+        x = torch.cat([self.token.expand(len(x), -1, -1), x], dim=1)  # (B,N,width) -> (B,1+N,width)
+        x = x + sinusoid(torch.arange(x.shape[1], device=x.device, dtype=x.dtype), x.shape[2])
+        x = self.layers(x, src_key_padding_mask=_after(1 + lengths, x.shape[1]))
+        return F.normalize(self.head(x[:, 0]), dim=-1)
+
+
+class Evaluator(nn.Module):
+    """One judge, with its vocabulary `words` and its own `mean` and `std` (dims,). ValueError: a config of no kind."""
+
+    def __init__(self, cfg: EvaluatorConfig, words: list[str]):
+        super().__init__()
+        if cfg.kind not in ("t2m", "clip") or cfg.dims not in (NUM_FEATURES, ESSENTIAL) or cfg.width % (2 * HEADS):
+            raise ValueError(f"expected 't2m' or 'clip', 263 or 67 dims, a width that {2 * HEADS} divides, got {cfg}")
+        self.cfg, self.words = cfg, list(words)
+        self.places = {word: place for place, word in enumerate(self.words, start=UNKNOWN + 1)}
+        self.register_buffer("mean", torch.zeros(cfg.dims))
+        self.register_buffer("std", torch.ones(cfg.dims))
+        self.embed_words = nn.Embedding(UNKNOWN + 1 + len(self.words), cfg.width)
+        if cfg.kind == "t2m":
+            down = [nn.Conv1d(cfg.dims, cfg.width, 4, 2, 1), nn.Conv1d(cfg.width, cfg.width, 4, 2, 1)]
+        else:
+            down = [nn.Conv1d(cfg.dims, cfg.width, GROUP, GROUP)]  # a linear map of four frames side by side
+            self.log_scale = nn.Parameter(torch.tensor(1 / 0.07).log())
+        self.down = nn.ModuleList(down)
+        reader = GRUReader if cfg.kind == "t2m" else TransformerReader
+        self.read_motion, self.read_words, self.dropout = reader(cfg), reader(cfg), nn.Dropout(DROPOUT)
+
+    def motion(self, x: Tensor, lengths: Tensor) -> Tensor:
+        """Raw features x (B,T,263), or their first `dims`, of `lengths` (B,) frames, 4 to T -> (B,embed_dim).
+
+        Neither what follows a motion's end is read nor a last group of less than four frames. ValueError: shapes.
+        """
+        fits = x.ndim == 3 and x.shape[2] in (NUM_FEATURES, self.cfg.dims) and lengths.shape == x.shape[:1] != (0,)
+        if not fits or lengths.min() < GROUP or lengths.max() > x.shape[1]:
+            raise ValueError(f"expected x (B,T,263), B lengths in 4..T; got {tuple(x.shape)}, {lengths.tolist()}")
+        ends = lengths.to(x.device) // GROUP * GROUP  # (B,)
+        x = x[..., : self.cfg.dims].sub(self.mean).div_(self.std).transpose(1, 2)  # (B,T,263) -> (B,dims,T)
+        for conv in self.down:  # each meets zeros past the end, as if nothing followed
+            x = F.leaky_relu(conv(x.masked_fill(_after(ends, x.shape[2]).unsqueeze(1), 0.0)), SLOPE)
+            ends = ends // conv.stride[0]  # in the end x is (B,width,T/4)
+        return self.read_motion(self.dropout(x.transpose(1, 2)), ends)
+
+    def sentences(self, sentences: list[str]) -> Tensor:
+        """Sentences -> (B,embed_dim). Only words count; a sentence that has none is one unknown word."""
+        ids = [[self.places.get(w, UNKNOWN) for w in WORD.findall(s.lower())] or [UNKNOWN] for s in sentences]
+        table = pad_sequence([torch.tensor(row) for row in ids], batch_first=True).to(self.mean.device)  # (B,S)
+        if self.training:  # as dropout does, from the global generator, which the loop keys by step
+            table = table.masked_fill(torch.rand(table.shape, device=table.device) < FORGET, UNKNOWN)
+        lengths = torch.tensor([len(row) for row in ids], device=table.device)
+        return self.read_words(self.dropout(self.embed_words(table)), lengths)
+
+    def similarity(self, motion: Tensor, text: Tensor) -> Tensor:
+        """Logits, (A,E) and (B,E) -> (A,B): minus squared distances, or cosines times a learnt scale of at most 100."""
+        if self.cfg.kind == "t2m":
+            return -(motion[:, None] - text).square().sum(-1)
+        return self.log_scale.exp().clamp(max=MAX_SCALE) * motion @ text.T
+
+
+def _after(lengths: Tensor, size: int) -> Tensor:
+    return torch.arange(size, device=lengths.device) >= lengths[:, None]  # (B,size): True past the end
+
+
+def train_evaluator(
+    cfg: EvaluatorConfig,
+    train_set: MotionDataset,
+    val_set: MotionDataset,
+    out: Path,
+    *,
+    steps: int,
+    batch: int,
+    lr: float,
+    seed: int,
+    resume: bool = False,
+    progress: bool = True,
+) -> LoopResult:
+    """Learn which sentence belongs to which motion; `ema["evaluator"]` of the result is the judge.
+
+    T2M pushes each motion from one wrong sentence, that of a neighbour in the batch; here from all at once (InfoNCE),
+    save those that say the same. A batch's motions are alike in length, so that no length alone gives a pair away.
+    """
+    own = step_key(seed, -4)  # not the teacher's seed, hence another order of the data
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(own)
+        said = " ".join(text for clip in train_set.clips for text in clip.captions).lower()
+        judge = Evaluator(cfg, sorted(set(WORD.findall(said))))
+    mean, std = torch.from_numpy(train_set.mean).float(), torch.from_numpy(train_set.std).float()
+    judge.mean, judge.std = mean[: cfg.dims].clone(), std[: cfg.dims].clone()
+
+    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        x, valid, texts, same = draw_captioned(train_set, batch, generator)
+        motion, text = judge.motion(x * std + mean, valid.sum(1)), judge.sentences(texts)  # (B,E) each
+        return contrastive_loss(judge.similarity(motion, text), same), {}
+
+    def validate(ema: nn.ModuleDict) -> dict[str, float]:
+        pairs = embed(ema["evaluator"], [c.captions[0] for c in val_set.clips], [c.features for c in val_set.clips])
+        found = r_precision(*pairs, pool=min(32, len(val_set)))
+        return dict(zip(("val_r_at_1", "val_r_at_2", "val_r_at_3"), found.tolist()))
+
+    loop = LoopConfig(steps, lr, warmup=steps // 15, weight_decay=0.01, ema=0.99, seed=own)
+    identity = asdict(cfg) | {"steps": steps, "batch": batch, "lr": lr, "seed": seed, "data": train_set.fingerprint}
+    name, models = f"evaluator_{cfg.kind}_{cfg.dims}", nn.ModuleDict({"evaluator": judge})
+    return fit(name, models, loss, validate, loop, Path(out), identity=identity, resume=resume, progress=progress)
+
+
+def train_bench(
+    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+) -> LoopResult:
+    """Train the three judges of a preset one after the other and write them into `out`/evaluator."""
+    cfg, judges, metrics, seconds = plan.train, nn.ModuleDict(), {}, 0.0
+    sizes = {"steps": cfg.evaluator_steps, "batch": cfg.evaluator_batch, "lr": cfg.evaluator_lr, "seed": cfg.seed}
+    for name, shape in BENCH.items():
+        result = train_evaluator(shape, train_set, val_set, out, **sizes, resume=resume, progress=progress)
+        judges[name], seconds = result.ema["evaluator"], seconds + result.seconds
+        metrics |= {f"{name}_{key}": value for key, value in result.metrics.items()}
+    facts = {**sizes, "data": train_set.fingerprint, "metrics": metrics, "seconds": round(seconds, 1)}
+    save_bench(out / "evaluator", dict(judges.items()), facts)
+    return LoopResult(nn.ModuleDict({"evaluator": judges}), metrics, seconds)
+
+
+@torch.no_grad()
+def embed(judge: Evaluator, sentences: list[str], motions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Text (N,E) and motion (M,E) embeddings, float64, of sentences and of raw features, one (T,263) a motion."""
+    order = np.argsort([len(x) for x in motions], kind="stable")
+    out = np.zeros((len(order), judge.cfg.embed_dim))
+    for chosen in np.array_split(order, -(-len(order) // 64)):  # motions of like length together
+        x = [torch.as_tensor(motions[i], dtype=torch.float32, device=judge.mean.device) for i in chosen]
+        out[chosen] = judge.motion(pad_sequence(x, batch_first=True), torch.tensor([len(row) for row in x])).cpu()
+    return judge.sentences(sentences).cpu().double().numpy(), out
+
+
+def save_bench(folder: str | Path, evaluators: dict[str, Evaluator], facts: dict[str, object]) -> None:
+    """Write judges, one file each, and last the card with their checksums and what else is known of them (`facts`)."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, judge in evaluators.items():
+        note = {"config": asdict(judge.cfg), "words": judge.words}
+        save_tensors(folder / f"{name}.safetensors", judge.state_dict(), note)
+    files = {name: checksum(folder / f"{name}.safetensors") for name in evaluators}
+    write_text(folder / "card.json", json.dumps({"format": FORMAT, **facts, "files": files}, indent=2) + "\n")
+
+
+def load_bench(folder: str | Path = "toy-bench-1") -> dict[str, Evaluator]:
+    """The judges of a folder, or the shipped ones, frozen, in eval mode. Raises FileNotFoundError or ValueError."""
+    folder = Path(__file__).parents[1] / "assets" / folder if str(folder) == "toy-bench-1" else Path(folder)
+    if not (folder / "card.json").is_file():
+        raise FileNotFoundError(f"no card.json in {folder}: `minicmdm train --stage evaluator` makes evaluators")
+    bench = {}
+    try:
+        card = json.loads((folder / "card.json").read_text(encoding="utf-8"))
+        if card.get("format") != FORMAT:
+            raise ValueError(f"format {FORMAT!r} expected in card.json, {card.get('format')!r} found")
+        for name, expected in card["files"].items():
+            path = folder / f"{name}.safetensors"
+            note = load_tensors(path)[1]  # says itself what is missing or cut short
+            if checksum(path) != expected:
+                raise ValueError(f"{path.name} is not the file of card.json: it was changed or mixed in")
+            bench[name] = Evaluator(EvaluatorConfig(**note["config"]), note["words"]).eval().requires_grad_(False)
+            load_weights(bench[name], path)
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"{folder} holds no evaluators that this version can read: {error}") from error
+    return bench
