@@ -5,7 +5,16 @@ import torch
 import torch.nn.functional as F
 from model_helpers import dependencies, lower_triangle, randomise
 
-from minicmdm.models.layers import Attention, CausalConv1d, ResidualBlock, RMSNorm, modulate, rotate, sinusoid
+from minicmdm.models.layers import (
+    Attention,
+    CausalConv1d,
+    KeyValueCache,
+    ResidualBlock,
+    RMSNorm,
+    modulate,
+    rotate,
+    sinusoid,
+)
 
 
 def over_time(conv):
@@ -28,6 +37,22 @@ def test_the_plain_convolution_looks_ahead_as_far_as_back():
     assert set(sees[3].nonzero().flatten().tolist()) == {2, 3, 4}
     halved = CausalConv1d(2, 2, 4, stride=2, causal=False)
     assert halved(torch.zeros(1, 2, 8)).shape == (1, 2, 4)
+
+
+@pytest.mark.parametrize("kernel, stride, dilation", [(3, 1, 1), (3, 1, 9), (1, 1, 1), (4, 2, 1), (5, 4, 2)])
+def test_a_convolution_in_pieces_is_the_whole_convolution(kernel, stride, dilation):
+    conv = randomise(CausalConv1d(2, 3, kernel, stride, dilation))
+    x, states = torch.randn(2, 2, 48, dtype=torch.float64), {}
+    pieces = [conv(piece, states) for piece in x.split([4, 12, 4, 8, 20], dim=-1)]
+    assert torch.allclose(torch.cat(pieces, dim=-1), conv(x), rtol=1e-12, atol=1e-14)
+    assert states[conv].shape == (2, 2, conv.padding[0])  # and the past that is kept does not grow
+    if conv.padding[0]:  # the control: without its past a piece begins with zeros
+        assert not torch.allclose(conv(x[..., 4:16]), pieces[1])
+
+
+def test_a_convolution_that_looks_ahead_cannot_work_in_pieces():
+    with pytest.raises(ValueError, match="looks ahead"):
+        CausalConv1d(2, 2, 3, causal=False)(torch.zeros(1, 2, 8), {})
 
 
 def test_residual_block_adds_to_its_input():
@@ -119,6 +144,61 @@ def test_keys_and_values_computed_earlier_give_the_same_answer(attention):
     keys, values = (torch.cat(pair, dim=2) for pair in zip(first, second))
     late = layer.attend(x[:, 3:], keys, values, mask[3:], positions[3:])
     assert torch.allclose(late, whole[:, 3:], rtol=1e-9)
+
+
+def test_no_mask_shows_everything(attention):
+    layer, x, context = attention
+    mask = torch.ones(2, 5, 4, dtype=torch.bool)
+    assert torch.equal(layer.attend(x, *layer.keys_values(context), None), layer(x, context, mask))
+
+
+def attend_one_by_one(layer, x, window, ahead=2):
+    """Latents become final one at a time; before that each is written `ahead` times with passing contents."""
+    cache = KeyValueCache(1, 2, 2, 4, window, x)
+    out = []
+    for i in range(x.shape[1]):
+        for attempt in range(ahead, -1, -1):  # the last attempt is the final one, with nothing behind it
+            active = x[:, i : i + 1 + attempt] + attempt
+            cache.make_room(active.shape[1])
+            positions = torch.arange(cache.end, cache.end + active.shape[1])
+            keys, values = cache.write(0, *layer.keys_values(active, positions))
+            out_i = layer.attend(
+                active[:, :1], keys[:, :, : len(cache) + 1], values[:, :, : len(cache) + 1], None, positions[:1]
+            )
+        cache.keep(1)
+        out.append(out_i)
+    return torch.cat(out, dim=1), cache
+
+
+def test_cached_attention_is_attention_over_a_window_wherever_its_slots_lie():
+    torch.manual_seed(0)
+    layer, x = randomise(Attention(8, heads=2)), torch.randn(2, 40, 8).double()
+    place = torch.arange(40)
+    for window in (40, 7):  # nothing slides; everything slides, and moves to the front five times
+        out, cache = attend_one_by_one(layer, x, window, ahead=2 if window == 40 else 0)
+        behind = place[:, None] - place
+        mask = (behind >= 0) & (behind < window)
+        assert torch.allclose(out, layer(x, x, mask, place), rtol=1e-9, atol=1e-12)
+        assert cache.keys.shape[3] == cache.values.shape[3] == 2 * window and cache.end <= 2 * window
+    assert not torch.allclose(out, layer(x, x, behind >= 0, place))  # the control: the window does hide
+
+
+def test_a_cache_in_float32_does_not_wear_out():
+    """After 2,000 latents the answer is as close to float64's as at the start: no position grows large."""
+    torch.manual_seed(0)
+    layer, x = randomise(Attention(8, heads=2)), torch.randn(2, 8, 8).double()
+    wide, _ = attend_one_by_one(layer, x, 8, ahead=0)
+    layer = layer.float()
+    cache = KeyValueCache(1, 2, 2, 4, 8, x.float())
+    with torch.no_grad():
+        for i in range(2_000):
+            cache.make_room(1)
+            position = torch.tensor([cache.end])
+            now = x[:, i % 8, None].float()
+            keys, values = cache.write(0, *layer.keys_values(now, position))
+            out = layer.attend(now, keys, values, None, position)
+            cache.keep(1)
+    assert (out[:, 0] - wide[:, -1]).abs().max() < 1e-5
 
 
 def test_heads_must_divide_the_width_into_pairs():

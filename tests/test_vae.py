@@ -46,6 +46,38 @@ def test_nothing_before_its_own_group_moves(down):
     assert sees[-1].all()
 
 
+@pytest.mark.parametrize("down", [2, 3])
+def test_a_vae_in_pieces_is_the_whole_vae(down):
+    vae = randomise(MACVAE(replace(TINY, down=down)))
+    z, group = torch.randn(2, 30, 3, dtype=torch.float64), 2**down
+    whole = vae.decode(z)
+    for sizes in ([1] * 30, [7, 1, 2, 20]):
+        states = {}
+        pieces = [vae.decode(piece, states) for piece in z.split(sizes, dim=1)]
+        assert torch.allclose(torch.cat(pieces, dim=1), whole, rtol=1e-9, atol=1e-12)
+        states = {}
+        pieces = [vae.encode(x, states)[0] for x in whole.split([group * n for n in sizes], dim=1)]
+        assert torch.allclose(torch.cat(pieces, dim=1), vae.encode(whole)[0], rtol=1e-9, atol=1e-12)
+    # the control: pieces that begin anew are something else
+    assert not torch.allclose(vae.decode(z[:, 7:8]), whole[:, 7 * group : 8 * group])
+
+
+def test_what_a_stream_keeps_of_the_past_does_not_grow():
+    vae, states, sizes = randomise(MACVAE(TINY)), {}, set()
+    for _ in range(3):
+        vae.decode(torch.zeros(1, 5, 3, dtype=torch.float64), states)
+        sizes.add(sum(state.numel() for state in states.values()))
+    assert (
+        len(sizes) == 1
+        and len(states) == len([m for m in vae.decoder.modules() if type(m).__name__ == "CausalConv1d"]) - 2 * 2
+    )
+
+
+def test_a_vae_that_looks_ahead_cannot_stream():
+    with pytest.raises(ValueError, match="looks ahead"):
+        MACVAE(replace(TINY, causal=False)).decode(torch.zeros(1, 2, 3), {})
+
+
 def test_the_plain_vae_looks_ahead():
     vae = randomise(MACVAE(replace(TINY, causal=False)))
     x = torch.randn(1, 16, 6, dtype=torch.float64)

@@ -1,8 +1,14 @@
-"""The bricks: causal convolution for the VAE; rotary attention, RMSNorm and modulation for the DiT."""
+"""The bricks: causal convolution for the VAE; rotary attention, RMSNorm and modulation for the DiT.
+
+Both halves also work in pieces, for endless streams. A convolution keeps the last inputs that its next output needs
+(`States`), attention keeps the keys and values of what will not change any more (`KeyValueCache`).
+"""
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+States = dict[nn.Module, Tensor]  # per convolution the end of its input so far; a stream begins with an empty one
 
 
 class CausalConv1d(nn.Module):
@@ -28,8 +34,16 @@ class CausalConv1d(nn.Module):
         right = 0 if causal else total // 2
         self.padding = (total - right, right)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return self.conv(F.pad(x, self.padding))
+    def forward(self, x: Tensor, states: States | None = None) -> Tensor:
+        """With `states`, x continues the x of the call before: its end stands where zeros would be padded."""
+        if states is None:
+            return self.conv(F.pad(x, self.padding))
+        left, right = self.padding
+        if right:
+            raise ValueError("only a causal convolution can work in pieces, and this one looks ahead")
+        x = torch.cat([states[self], x], dim=-1) if self in states else F.pad(x, self.padding)
+        states[self] = x[..., x.shape[-1] - left :]  # (B,C_in,left)
+        return self.conv(x)
 
 
 class ResidualBlock(nn.Module):
@@ -40,8 +54,8 @@ class ResidualBlock(nn.Module):
         self.dilated = CausalConv1d(channels, channels, 3, dilation=dilation, causal=causal)
         self.mix = CausalConv1d(channels, channels, 1, causal=causal)
 
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.mix(F.relu(self.dilated(F.relu(x))))
+    def forward(self, x: Tensor, states: States | None = None) -> Tensor:
+        return x + self.mix(F.relu(self.dilated(F.relu(x), states)))  # the k1 convolution has no past to keep
 
 
 class RMSNorm(nn.Module):
@@ -113,23 +127,71 @@ class Attention(nn.Module):
         """Keys and values (B,H,S,d) of a context (B,S,dim) whose entries stand at `positions` (S,)."""
         return self.split(self.key_norm(self.key(context)), positions), self.split(self.value(context), None)
 
-    def attend(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor, positions=None) -> Tensor:
-        """x (B,N,dim) looks at keys and values (B,H,S,d) where mask (N,S) or (B,N,S) is True -> (B,N,dim)."""
+    def attend(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, positions=None) -> Tensor:
+        """x (B,N,dim) looks at keys and values (B,H,S,d) where mask (N,S) or (B,N,S) is True -> (B,N,dim).
+
+        No mask shows everything.
+        """
         queries = self.split(self.query_norm(self.query(x)), positions)
         queries = queries * queries.shape[-1] ** -0.5  # here rather than on the scores, which are more numbers
-        mask = mask if mask.ndim == 2 else mask.unsqueeze(1)  # (B,N,S) -> (B,1,N,S): the same for all heads
+        if mask is not None and mask.ndim == 3:
+            mask = mask.unsqueeze(1)  # (B,N,S) -> (B,1,N,S): the same for all heads
         # Written out rather than `scaled_dot_product_attention`: with 49 latents there is no memory to save, and on
         # a CPU in bfloat16 the fused backward pass is ten times slower than this. Autocast is off because it would
         # widen every score to float32; a softmax sums in float32 by itself.
         with torch.autocast(x.device.type, enabled=False):
             keys, values = keys.to(queries.dtype), values.to(queries.dtype)
             scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
-            weights = scores.masked_fill(~mask, torch.finfo(scores.dtype).min).softmax(-1)
-            out = weights @ values  # (B,H,N,d)
+            if mask is not None:
+                scores = scores.masked_fill(~mask, torch.finfo(scores.dtype).min)
+            out = scores.softmax(-1) @ values  # (B,H,N,d)
         # A query that may look at nothing has a softmax over equal scores; its answer is zero, not their mean.
-        nothing = ~mask.any(-1, keepdim=True)
-        out = out.masked_fill(nothing, 0.0) if nothing.any() else out
+        if mask is not None and (nothing := ~mask.any(-1, keepdim=True)).any():
+            out = out.masked_fill(nothing, 0.0)
         return self.out(out.transpose(1, 2).flatten(2))  # (B,N,dim)
 
     def forward(self, x: Tensor, context: Tensor, mask: Tensor, positions=None) -> Tensor:
         return self.attend(x, *self.keys_values(context, positions), mask, positions)
+
+
+class KeyValueCache:
+    """Keys and values, for every layer, of latents that will not change any more, and room for those that still do.
+
+    They lie in numbered slots: [first, end) are kept, and what is written comes after, again and again until `keep`
+    moves the end. A latent's slot is also its rotary position. When the slots run out, what is still in the window
+    moves to slot 0 and its keys are turned back by as much: attention hears distances only, so nothing changes, the
+    memory never grows, and no position is ever so large that its angle loses digits.
+    """
+
+    def __init__(self, layers: int, batch: int, heads: int, width: int, window: int, like: Tensor):
+        self.window = window  # the most latents that one call sees
+        self.first = self.end = 0
+        # Twice the window, so that moving to the front, once in `window` latents, costs next to nothing.
+        self.keys = like.new_zeros(layers, batch, heads, 2 * window, width)
+        self.values = torch.zeros_like(self.keys)
+
+    def make_room(self, count: int) -> None:
+        """Before a call that writes `count` latents: forget what leaves the window."""
+        self.first = max(self.first, self.end + count - self.window)
+        if self.end + count > self.keys.shape[3]:
+            kept = slice(self.first, self.end)
+            back = torch.tensor([-self.first], device=self.keys.device)
+            # rotate() wants (..., slots, heads, d) and one position for all of them
+            keys = rotate(self.keys[..., kept, :].transpose(2, 3), back).transpose(2, 3)
+            values = self.values[..., kept, :].clone()
+            self.first, self.end = 0, self.end - self.first
+            self.keys[..., : self.end, :], self.values[..., : self.end, :] = keys, values
+
+    def write(self, layer: int, keys: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Put one layer's (B,H,n,d) after the kept ones; return all that its queries may look at, (B,H,kept+n,d)."""
+        stop = self.end + keys.shape[2]
+        self.keys[layer, :, :, self.end : stop] = keys
+        self.values[layer, :, :, self.end : stop] = values
+        return self.keys[layer, :, :, self.first : stop], self.values[layer, :, :, self.first : stop]
+
+    def keep(self, count: int) -> None:
+        """The first `count` of the latents just written are final."""
+        self.end += count
+
+    def __len__(self) -> int:
+        return self.end - self.first

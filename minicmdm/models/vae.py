@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from minicmdm.config import TrainConfig, VAEConfig
-from minicmdm.models.layers import CausalConv1d, ResidualBlock
+from minicmdm.models.layers import CausalConv1d, ResidualBlock, States
 
 ROOT_DIMS = 4  # the first features of both the 263 and the essential 67: yaw and planar velocity, height
 
@@ -63,9 +63,10 @@ class MACVAE(nn.Module):
             conv(width, width), nn.ReLU(), *up, conv(width, width), nn.ReLU(), conv(width, cfg.input_dim)
         )
 
-    def encode(self, x: Tensor) -> tuple[Tensor, Tensor]:
+    def encode(self, x: Tensor, states: States | None = None) -> tuple[Tensor, Tensor]:
         """Normalised features (B,T,D) -> mean and log-variance (B,N,C) of each latent, N = T / 2**down.
 
+        `states`, as in `decode`, lets a motion come in pieces.
         ValueError: T is not a positive multiple of `2**down`, or D is not the width this VAE was built for.
         """
         group = self.cfg.frames_per_latent
@@ -74,15 +75,20 @@ class MACVAE(nn.Module):
                 f"the VAE encodes (batch, frames, {self.cfg.input_dim}) with frames a positive multiple of "
                 f"{group}, got {tuple(x.shape)}"
             )
-        hidden = self.encoder(x.transpose(1, 2)).transpose(1, 2)  # (B,T,D) -> (B,N,width)
+        hidden = _in_pieces(self.encoder, x.transpose(1, 2), states).transpose(1, 2)  # (B,T,D) -> (B,N,width)
         mean, logvar = self.to_gaussian(hidden).chunk(2, dim=-1)  # 2 x (B,N,C)
         return mean, logvar.clamp(-30, 20)
 
-    def decode(self, z: Tensor) -> Tensor:
-        """Latents (B,N,C) -> normalised features (B,T,D), T = N * 2**down."""
+    def decode(self, z: Tensor, states: States | None = None) -> Tensor:
+        """Latents (B,N,C) -> normalised features (B,T,D), T = N * 2**down.
+
+        With `states`, a dictionary that is empty at first, z continues the z of the call before: every layer keeps the
+        end of its input, so the pieces together are what one call on all latents would give. ValueError: not a
+        latent's shape, or pieces for a VAE that looks ahead.
+        """
         if z.ndim != 3 or z.shape[-1] != self.cfg.latent_dim or z.shape[1] == 0:
             raise ValueError(f"the VAE decodes (batch, latents >= 1, {self.cfg.latent_dim}), got {tuple(z.shape)}")
-        return self.decoder(self.from_latent(z).transpose(1, 2)).transpose(1, 2)
+        return _in_pieces(self.decoder, self.from_latent(z).transpose(1, 2), states).transpose(1, 2)
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> VAEOutput:
         """Encode, sample with the generator's noise, decode. (B,T,D) -> VAEOutput."""
@@ -124,6 +130,13 @@ def vae_loss(output: VAEOutput, x: Tensor, cfg: TrainConfig) -> VAELoss:
     kl = 0.5 * (mean.square() + logvar.exp() - 1 - logvar).sum(dim=(1, 2)).mean()
     kl = kl / (num_frames * num_features)
     return VAELoss(recon + cfg.root_weight * root + cfg.kl_weight * kl, recon, root, kl)
+
+
+def _in_pieces(layers: nn.Sequential, x: Tensor, states: States | None) -> Tensor:
+    """Run the layers; those that look back over time find and leave their past in `states`. (B,C,T) -> (B,C',T')"""
+    for layer in layers:
+        x = layer(x, states) if isinstance(layer, (CausalConv1d, ResidualBlock)) else layer(x)
+    return x
 
 
 def _half_log(mse: Tensor) -> Tensor:
