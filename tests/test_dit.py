@@ -7,7 +7,7 @@ import torch
 from model_helpers import dependencies, lower_triangle, randomise
 
 from minicmdm.config import DiTConfig
-from minicmdm.models.dit import CausalDiT, self_attention_mask
+from minicmdm.models.dit import CausalDiT, draw_boundary, self_attention_mask
 
 TINY = DiTConfig(latent_dim=3, text_dim=5, dim=16, layers=2, heads=2, time_dim=8)
 
@@ -47,13 +47,50 @@ def test_mask_of_the_paper_and_of_the_release():
     assert self_attention_mask(4, 3, "causal").int().tolist() == [[1, 1, 1, 0]] * 3 + [[1, 1, 1, 1]]
 
 
+def test_window_is_causal_before_the_boundary_and_open_after():
+    committed = torch.tensor([[True, True, False, False], [False] * 4])
+    mask = self_attention_mask(4, 3, "window", committed=committed)  # whatever the block size
+    assert mask[0].int().tolist() == [[1, 0, 0, 0], [1, 1, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1]]
+    assert mask[1].all()
+    with pytest.raises(ValueError, match="committed"):
+        self_attention_mask(4, 1, "window")
+
+
+@pytest.mark.parametrize("finished", [0, 3, 8])
+def test_a_window_model_takes_clean_latents_for_the_past(finished):
+    model = randomise(CausalDiT(replace(TINY, attention="window")))
+    z_t, t, words, mask = inputs()
+    t = 0.9 * t
+    t[:, :finished] = 1.0
+    committed = torch.arange(8).expand(1, -1) < finished
+    expected = self_attention_mask(8, 1, "window", committed=committed)[0]
+    assert torch.equal(dependencies(lambda z: model(z, t, words, mask), z_t), expected)
+    assert torch.equal(model(z_t, t, words, mask), model(z_t, t, words, mask, committed=committed))
+    everything = torch.zeros_like(committed)  # the control: who is committed can be said, and then it counts
+    assert dependencies(lambda z: model(z, t, words, mask, committed=everything), z_t).all()
+
+
+def test_the_boundary_of_training_is_drawn_everywhere():
+    valid = torch.arange(10) < torch.tensor([10, 7, 1])[:, None].repeat(1, 1).repeat_interleave(2000, 0)
+    committed, visible = draw_boundary(valid, 3, torch.Generator().manual_seed(0))
+    past, shown = committed.sum(1), visible.sum(1)
+    place = torch.arange(10)
+    assert torch.equal(committed, place < past[:, None]) and torch.equal(visible, place < shown[:, None])
+    assert (past < shown).all() and (visible <= valid).all()  # somebody is in flight, and no padding is
+    assert set(past[:2000].tolist()) == {0, 3, 6, 9} and set(shown[:2000].tolist()) == {3, 6, 9, 10}
+    assert set(shown[2000:4000].tolist()) == {3, 6, 7} and set(shown[4000:].tolist()) == {1}
+    assert abs((past[:2000] == 0).float().mean() - (1 / 4 + 3 / 4 / 4)) < 0.05
+    again = draw_boundary(valid, 3, torch.Generator().manual_seed(0))
+    assert torch.equal(again[0], committed) and torch.equal(again[1], visible)
+
+
 def test_dropping_the_future_changes_nothing(model):
     z_t, t, words, mask = inputs(latents=70)  # longer than the release's table of 49 positions
     whole, part = model(z_t, t, words, mask), model(z_t[:, :30], t[:, :30], words, mask[:, :30])
     assert torch.allclose(whole[:, :30], part, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("attention", ["causal", "bidirectional"])
+@pytest.mark.parametrize("attention", ["causal", "bidirectional", "window"])
 def test_padding_of_latents_and_of_words_changes_nothing(attention):
     model = randomise(CausalDiT(replace(TINY, attention=attention)))
     z_t, t, words, mask = inputs(batch=2)

@@ -9,16 +9,22 @@ Every block does three things (CMDM Sec. 4.2, A.2; where the paper is silent, th
 The six modulation vectors come from the latent's own time t, per block and per latent (AdaLN): diffusion
 forcing needs that, as neighbours stand at different levels. They start at zero, and so does the output
 layer, so a new model predicts zero and each block starts as its cross-attention alone.
+
+`forward` is for training and for samplers that know the whole motion. A stream (diffusion/streaming.py) calls
+its parts: what depends on the noise level alone (`modulations`), on the words alone (`read_words`), and the
+rest (`evaluate`), which can leave the keys and values of finished latents in a cache.
 """
+
+from functools import partial
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from minicmdm.config import DiTConfig
-from minicmdm.models.layers import Attention, modulate, sinusoid
+from minicmdm.models.layers import Attention, KeyValueCache, modulate, sinusoid
 
-ATTENTION = ("causal", "bidirectional")
+ATTENTION = ("causal", "bidirectional", "window")
 CLOCK_DIM = 64  # waves for each of the clock's two numbers
 
 
@@ -28,20 +34,50 @@ def self_attention_mask(
     attention: str,
     valid: Tensor | None = None,
     device: torch.device | str | None = None,
+    committed: Tensor | None = None,
 ) -> Tensor:
-    """Which latent (row) may look at which (column): (N,N) bool, or (B,N,N) when valid (B,N) hides padding.
+    """Which latent (row) may look at which (column): (N,N) bool, or (B,N,N) with valid or committed (B,N).
 
     "causal": block i looks at blocks up to i, so the latents of one block see each other. block_size 1 is
-    the paper's lower triangle, 3 is the release. "bidirectional": everything.
+    the paper's lower triangle, 3 is the release. "bidirectional": everything. "window" (ours): committed latents are
+    clean and never look ahead, so their keys and values are final; those in flight look at everything. There the
+    blocks play no part. `valid` hides padding.
     """
+    place = torch.arange(num_latents, device=device)
     if attention == "bidirectional":
         mask = torch.ones(num_latents, num_latents, dtype=torch.bool, device=device)
+    elif attention == "window":
+        if committed is None:
+            raise ValueError('attention "window" must be told which latents are committed')
+        back = (place[:, None] >= place) & committed.unsqueeze(1)  # (B,N,N): committed ones, and never ahead
+        mask = back | ~committed.unsqueeze(2)
     else:
-        block = torch.arange(num_latents, device=device) // block_size
+        block = place // block_size
         mask = block[:, None] >= block[None, :]  # (N,N)
     if valid is not None:
         mask = mask & valid.unsqueeze(1)  # (B,1,N): padding is never looked at
     return mask
+
+
+def draw_boundary(
+    valid: Tensor, block_size: int = 1, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """For training the "window" mask: draw where the committed past ends and where the visible future ends.
+
+    valid (B,N) -> committed and visible, (B,N) bool each, both cut between blocks. A quarter of the samples have no
+    past, as a motion has at its start, and the others any; half of the samples show all that is left, and the others
+    any part of it, since a sampler hides what still waits. At least one block is in flight. The caller gives committed
+    latents t = 1 and no noise, hides what is not visible (`valid`), and counts the loss on visible & ~committed.
+    """
+    batch, num_latents = valid.shape
+    device = generator.device if generator is not None else valid.device
+    luck = torch.rand(batch, 3, generator=generator, device=device).to(valid.device)
+    blocks = -(-valid.sum(1) // block_size)  # (B,)
+    past = ((luck[:, 0] * 4 - 1).clamp(min=0) / 3 * blocks).long().clamp(max=blocks - 1)  # (B,), 0 .. blocks-1
+    shown = past + 1 + (luck[:, 1] * (blocks - past)).long().clamp(max=blocks - past - 1)  # (B,), past+1 .. blocks
+    shown = torch.where(luck[:, 2] < 0.5, blocks, shown)
+    block = torch.arange(num_latents, device=valid.device) // block_size  # (N,)
+    return valid & (block < past[:, None]), valid & (block < shown[:, None])
 
 
 def clock_features(t: Tensor, clock: Tensor | None) -> Tensor:
@@ -79,18 +115,21 @@ class Block(nn.Module):
     def forward(
         self,
         x: Tensor,
-        time: Tensor,
-        which: Tensor,
-        mask: Tensor,
+        modulation: Tensor,
+        words: tuple[Tensor, Tensor],
+        word_mask: Tensor | None,
+        mask: Tensor | None,
         positions: Tensor,
-        words: Tensor,
-        word_mask: Tensor,
+        write=None,
     ) -> Tensor:
-        modulation = F.embedding(which, self.modulation(time))  # (U,dim) -> (U,6*dim) -> (B,N,6*dim)
+        """x (B,N,dim), modulation (B,N,6*dim), words as keys and values; `write` adds what a cache has kept."""
         shift1, scale1, gate1, shift2, scale2, gate2 = modulation.chunk(6, dim=-1)  # 6 x (B,N,dim)
         h = modulate(self.norm1(x), shift1, scale1)
-        x = x + gate1 * self.self_attention(h, h, mask, positions)
-        x = x + self.cross_attention(self.norm2(x), words, word_mask)
+        keys, values = self.self_attention.keys_values(h, positions)
+        if write is not None:
+            keys, values = write(keys, values)  # (B,H,N,d) -> (B,H,kept+N,d)
+        x = x + gate1 * self.self_attention.attend(h, keys, values, mask, positions)
+        x = x + self.cross_attention.attend(self.norm2(x), *words, word_mask)
         return x + gate2 * self.feedforward(modulate(self.norm3(x), shift2, scale2))
 
 
@@ -125,33 +164,68 @@ class CausalDiT(nn.Module):
         word_mask: Tensor,
         valid: Tensor | None = None,
         clock: Tensor | None = None,
+        committed: Tensor | None = None,
     ) -> Tensor:
         """Predict the velocity of every latent.
 
         z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,E) with word_mask (B,N,S), True where latent n
         may see word s (a row without any True sees no words at all); valid (B,N), False on padding; clock
-        (B,N,2), see `clock_features`, read only by a model that has one. -> (B,N,C).
+        (B,N,2), see `clock_features`, read only by a model that has one; committed (B,N), the finished past under the
+        "window" mask, by default those at t = 1. -> (B,N,C).
         """
-        self._check(z_t, t, words, word_mask, valid, clock)
+        self._check(z_t, t, words, word_mask, valid, clock, committed)
         num_latents = z_t.shape[1]
         positions = torch.arange(num_latents, device=z_t.device)
         # The one place that decides who sees whom.
-        mask = self_attention_mask(num_latents, self.cfg.block_size, self.cfg.attention, valid, z_t.device)
+        committed = t >= 1 if committed is None else committed
+        mask = self_attention_mask(num_latents, self.cfg.block_size, self.cfg.attention, valid, z_t.device, committed)
+        # A batch has far more latents than levels, and modulation is a third of the work: do it once a level.
+        levels, which = t.unique(return_inverse=True)  # (U,), and for every latent its place there (B,N)
+        told = clock_features(t, clock) if self.cfg.clock else None
+        modulations = self.modulations(levels)
+        return self.evaluate(z_t, which, modulations, self.read_words(words), word_mask, mask, positions, told)
+
+    def modulations(self, levels: Tensor) -> list[Tensor]:
+        """What every block makes of the times (U,): its six modulation vectors, (U,6*dim) each."""
         # The release feeds t in [0,1] as it is, but the fastest of these waves turns one radian per unit:
         # over [0,1] most of them hardly move. Times 1000, the scale they were made for, neighbouring
         # levels look different.
-        # A batch has far more latents than levels, and modulation is a third of the work: do it once a level.
-        levels, which = t.unique(return_inverse=True)  # (U,), and for every latent its place there (B,N)
-        time = self.embed_time(sinusoid(1000 * levels, self.cfg.time_dim))  # (U,) -> (U,dim)
+        waves = sinusoid(1000 * levels, self.cfg.time_dim).to(self.out.weight.dtype)
+        time = self.embed_time(waves)  # (U,time_dim) -> (U,dim)
+        return [block.modulation(time) for block in self.blocks]
+
+    def read_words(self, words: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each."""
         words = self.embed_words(words)  # (B,S,E) -> (B,S,dim)
+        return [block.cross_attention.keys_values(words) for block in self.blocks]
+
+    def evaluate(
+        self,
+        z_t: Tensor,
+        which: Tensor,
+        modulations: list[Tensor],
+        words: list[tuple[Tensor, Tensor]],
+        word_mask: Tensor | None,
+        mask: Tensor | None,
+        positions: Tensor,
+        told: Tensor | None,
+        cache: KeyValueCache | None = None,
+    ) -> Tensor:
+        """The velocity (B,N,C) of latents z_t (B,N,C) at positions (N,), the rest of the work being done.
+
+        which (B,N) numbers the rows of `modulations`; `words` comes from `read_words`, with word_mask (B,N,S); mask
+        (N,N') or (B,N,N') covers the N' - N latents of the cache first; told (B,N,.) are `clock_features`.
+        """
         x = self.embed_latent(z_t)  # (B,N,C) -> (B,N,dim)
-        if self.cfg.clock:
-            x = x + self.embed_clock(clock_features(t, clock))
-        for block in self.blocks:
-            x = block(x, time, which, mask, positions, words, word_mask)
+        if told is not None:
+            x = x + self.embed_clock(told)
+        for layer, block in enumerate(self.blocks):
+            modulation = F.embedding(which, modulations[layer])  # (U,6*dim) -> (B,N,6*dim)
+            write = None if cache is None else partial(cache.write, layer)
+            x = block(x, modulation, words[layer], word_mask, mask, positions, write)
         return self.out(x)  # (B,N,dim) -> (B,N,C)
 
-    def _check(self, z_t, t, words, word_mask, valid, clock):
+    def _check(self, z_t, t, words, word_mask, valid, clock, committed):
         batch, num_latents = z_t.shape[:2]
         expected = {
             "z_t": (z_t, (batch, num_latents, self.cfg.latent_dim)),
@@ -160,6 +234,7 @@ class CausalDiT(nn.Module):
             "word_mask": (word_mask, (batch, num_latents, words.shape[1])),
             "valid": (valid, (batch, num_latents)),
             "clock": (clock, (batch, num_latents, 2)),
+            "committed": (committed, (batch, num_latents)),
         }
         for name, (tensor, shape) in expected.items():
             if tensor is not None and tuple(tensor.shape) != shape:
