@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_times
-from minicmdm.diffusion.path import data_to_velocity
+from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_committed, draw_times
+from minicmdm.diffusion.path import cosine_alpha_bar, data_to_velocity
 
 
 def seeded(seed=0):
@@ -71,3 +71,74 @@ def test_the_model_receives_text_and_mask_as_they_are():
 
     diffusion_forcing_loss(model, torch.randn(2, 6, 3), "words", "mask", None, block_size=3, clock="clock")
     assert seen == [(torch.Size([2, 6]), "words", "mask", None, "clock")]
+
+
+# --- the paper's objective ------------------------------------------------------------------------------------------
+
+
+def test_the_papers_objective_is_noise_at_integer_levels_on_its_own_path():
+    """CMDM Eqs 9 and 10, Alg. 1: with z known, x says what the noise was."""
+    z, times = 2 * torch.randn(64, 40, 4, dtype=torch.float64, generator=seeded()), []
+
+    def knows(x, t, *_):
+        times.append(t)
+        alpha_bar = cosine_alpha_bar(1 - t).unsqueeze(-1)
+        return (x - alpha_bar.sqrt() * z) / (1 - alpha_bar).sqrt().clamp_min(1e-9)
+
+    losses = [
+        diffusion_forcing_loss(m, z, None, None, block_size=2, generator=seeded(), path="ddpm")
+        for m in (knows, lambda x, *_: torch.zeros_like(x), lambda x, *_: x)
+    ]
+    level = 1000 * (1 - times[0])
+    assert torch.allclose(level, level.round(), atol=1e-9) and level.min() >= 0 and level.max() <= 1000
+    assert torch.equal(level[:, ::2], level[:, 1::2]) and len(level.unique()) > 50
+    assert losses[0] < 0.02  # only level 0 holds nothing of its noise
+    assert math.isclose(losses[1], 1, rel_tol=0.05)  # Var eps
+    assert losses[2] > 1  # x is not the noise
+
+
+def test_every_level_is_drawn_as_often(monkeypatch):
+    t = torch.arange(4004, dtype=torch.float64).reshape(1, -1) / 4004  # a fine and even comb
+    monkeypatch.setattr("minicmdm.diffusion.forcing.draw_times", lambda *_: t)
+    seen = []
+    model = lambda x, t, *_: seen.append(t) or x  # noqa: E731
+    diffusion_forcing_loss(model, torch.zeros(1, 4004, 1, dtype=torch.float64), None, None, path="ddpm")
+    counts = torch.bincount((1000 * (1 - seen[0][0])).round().long())
+    assert len(counts) == 1001 and counts.min() >= 3 and counts.max() <= 5  # rounding may move one to a neighbour
+
+
+def test_an_unknown_path_is_refused():
+    with pytest.raises(ValueError, match="'flow' or 'ddpm'"):
+        diffusion_forcing_loss(lambda z_t, *_: z_t, torch.zeros(1, 2, 3), None, None, path="vp")
+
+
+# --- window attention -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("block_size", [1, 3])
+def test_the_boundary_is_uniform_over_blocks_and_leaves_one_to_denoise(block_size):
+    valid = torch.arange(9) < torch.tensor([9, 4]).repeat(1000)[:, None]
+    committed = draw_committed(2000, 9, block_size, valid, seeded())
+    assert committed.shape == (2000, 9) and not (committed[:, :-1] < committed[:, 1:]).any()  # a prefix
+    for length, rows in ((9, committed[::2]), (4, committed[1::2])):
+        counts = torch.bincount(rows.sum(1))
+        blocks = -(-length // block_size)
+        assert counts.nonzero().flatten().tolist() == [block_size * b for b in range(blocks)]
+        assert (counts[counts > 0] - 1000 / blocks).abs().max() < 100
+    assert (valid & ~committed).any(1).all()
+
+
+@pytest.mark.parametrize("path", ["flow", "ddpm"])
+def test_the_committed_are_given_clean_and_are_not_asked_for(path):
+    z, seen = torch.randn(16, 6, 3, generator=seeded()), []
+
+    def model(x, t, words, mask, valid, clock, committed):
+        seen.append((x, t, committed))
+        return torch.where(committed[..., None], torch.nan, 0 * x)
+
+    valid = torch.arange(6) < torch.arange(16)[:, None] % 6 + 1
+    loss = diffusion_forcing_loss(model, z, None, None, valid, generator=seeded(1), path=path, window=True)
+    x, t, committed = seen[0]
+    assert committed.any() and loss.isfinite() and loss > 0.5
+    assert torch.equal(x[committed], z[committed]) and (t[committed] == 1).all()
+    assert (t[~committed] < 1).float().mean() > 0.9

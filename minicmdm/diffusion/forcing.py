@@ -8,7 +8,7 @@ noisy that any scheduling matrix can present.
 import torch
 from torch import Tensor
 
-from minicmdm.diffusion.path import interpolate, velocity
+from minicmdm.diffusion.path import DDPM_LEVELS, cosine_alpha_bar, interpolate, velocity
 
 LEVELS = 64  # different times in one batch
 
@@ -26,6 +26,21 @@ def draw_times(batch: int, num_latents: int, block_size: int, generator: torch.G
     return t.repeat_interleave(block_size, dim=1)[:, :num_latents]  # (B,N)
 
 
+def draw_committed(
+    batch: int, num_latents: int, block_size: int, valid: Tensor | None, generator: torch.Generator | None = None
+) -> Tensor:
+    """Which latents are finished (B,N) bool: whole blocks before a boundary that is uniform over the valid blocks.
+
+    Window attention is trained with it: latents before the boundary are clean and causal, and at least one block is
+    left to denoise.
+    """
+    device = generator.device if generator is not None else None
+    length = torch.full((batch,), num_latents, device=device) if valid is None else valid.sum(1).to(device)
+    blocks = (length + block_size - 1) // block_size
+    boundary = (torch.rand(batch, generator=generator, device=device) * blocks).floor() * block_size  # (B,)
+    return torch.arange(num_latents, device=device) < boundary[:, None]
+
+
 def diffusion_forcing_loss(
     model,
     z: Tensor,
@@ -35,20 +50,40 @@ def diffusion_forcing_loss(
     block_size: int = 1,
     generator: torch.Generator | None = None,
     clock: Tensor | None = None,
+    path: str = "flow",
+    window: bool = False,
 ) -> Tensor:
-    """The velocity's mean squared error over valid latents (CMDM Eq. 7 in its released, flow form). Scalar.
+    """The prediction's mean squared error over valid latents (CMDM Eq. 10, Alg. 1). Scalar.
 
     z (B,N,C) are normalised clean latents; words (B,S,E), word_mask (B,N,S), valid (B,N) and clock (B,N,2) go to
     `model` as they are. Text drop is the caller's: it replaces a sample's sentence by "" before encoding, which
     keeps the words, the per-latent mask and the null branch of guidance one and the same thing.
+    path: "flow" asks for the velocity at t, as the release does; "ddpm" for the noise at integer levels k of 0..1000,
+    as the paper writes, and tells the model 1 - k/1000. window: a random number of blocks at the start is clean
+    (`draw_committed`), the model hears of them as `committed` (B,N), and they are not asked for.
     """
     batch, num_latents, _ = z.shape
     t = draw_times(batch, num_latents, block_size, generator).to(z)
     device = generator.device if generator is not None else z.device
     eps = torch.randn(z.shape, generator=generator, device=device).to(z)
-    predicted = model(interpolate(z, eps, t), t, words, word_mask, valid, clock)
-    error = (predicted - velocity(z, eps)).square().mean(-1)  # (B,N,C) -> (B,N)
-    if valid is None:
+    asked, more = valid, {}
+    if window:
+        committed = draw_committed(batch, num_latents, block_size, valid, generator).to(z.device)
+        t = t.masked_fill(committed, 1.0)
+        asked, more = ~committed if valid is None else valid & ~committed, {"committed": committed}
+    if path == "flow":
+        noisy, target = interpolate(z, eps, t), velocity(z, eps)
+    elif path == "ddpm":
+        level = ((1 - t) * (DDPM_LEVELS + 1)).ceil() - 1  # uniform on 0..K for t uniform on [0,1); 1 - k/K is t again
+        level = level.clamp_min(0)  # the finished ones, t = 1
+        t = 1 - level / DDPM_LEVELS
+        alpha_bar = cosine_alpha_bar(level / DDPM_LEVELS).unsqueeze(-1)  # (B,N,1)
+        noisy, target = alpha_bar.sqrt() * z + (1 - alpha_bar).sqrt() * eps, eps
+    else:
+        raise ValueError(f"unknown path {path!r}: expected 'flow' or 'ddpm'")
+    predicted = model(noisy, t, words, word_mask, valid, clock, **more)
+    error = (predicted - target).square().mean(-1)  # (B,N,C) -> (B,N)
+    if asked is None:
         return error.mean()
     # `where` rather than a product: whatever stands in the padding, even NaN, stays out.
-    return torch.where(valid, error, 0).sum() / valid.sum().clamp_min(1)
+    return torch.where(asked, error, 0).sum() / asked.sum().clamp_min(1)
