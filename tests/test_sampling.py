@@ -8,7 +8,9 @@ import torch
 from model_helpers import dependencies, lower_triangle, randomise
 
 from minicmdm.config import DiTConfig, VAEConfig
-from minicmdm.diffusion.sampling import guided, sample, sample_steps
+from minicmdm.diffusion import sampling
+from minicmdm.diffusion.path import level_to_time, velocity_to_noise
+from minicmdm.diffusion.sampling import SOLVERS, from_noise_prediction, guided, sample, sample_steps
 from minicmdm.diffusion.schedules import KINDS, schedule_matrix
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.vae import MACVAE
@@ -50,10 +52,18 @@ MEAN = torch.tensor([0.5, -1.0, 2.0, 0.0], dtype=torch.float64)
 COVARIANCE = 0.8 ** (torch.arange(4)[:, None] - torch.arange(4)).abs().double() * 0.7  # neighbours correlate
 
 
-def moments(denoise, matrix):
-    """The sampler is affine in its noise here, so its mean and covariance are exact: no sampling error."""
-    points = torch.cat([torch.zeros(1, 4, 1), torch.eye(4).unsqueeze(-1)]).double()
-    out = sample(denoise, matrix, points)[..., 0]
+def moments(denoise, matrix, **how):
+    """The sampler is affine in all its noise here, so its mean and covariance are exact: no sampling error.
+
+    The batch holds zero, then one unit for each number of the first noise, then one for each number drawn later.
+    """
+    units = torch.eye(4 * len(matrix), dtype=torch.float64).reshape(-1, len(matrix), 4, 1)
+    units = torch.cat([torch.zeros_like(units[:1]), units])  # (1 + 4M, M, 4, 1)
+    draws = iter(units.unbind(1))
+    start = next(draws)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling.torch, "randn", lambda *_, **__: next(draws))
+        out = sample(denoise, matrix, start, generator=torch.Generator(), **how)[..., 0]
     linear = (out[1:] - out[0]).T
     return out[0], linear @ linear.T
 
@@ -83,6 +93,181 @@ def test_a_causal_denoiser_is_exact_when_autoregressive_and_not_when_all_move_to
     _, full = moments(denoise, schedule_matrix(4, 100, kind="full"))
     assert (turn - COVARIANCE).abs().max() < 0.02
     assert (full - COVARIANCE).abs().max() > 0.05
+
+
+# --- solvers ---------------------------------------------------------------------------------------------------------
+
+VARIANCE = torch.diag(torch.tensor([0.25, 1.0, 4.0, 0.09]).double())
+HOW = [
+    dict(solver="euler", path="ddpm"),
+    dict(solver="heun", path="flow"),
+    dict(solver="heun", path="ddpm"),
+    dict(solver="ddim", path="ddpm"),
+    dict(solver="ddim", path="flow", eta=0.5),
+    dict(solver="ddpm", path="flow"),
+    dict(solver="ddpm", path="ddpm"),
+]
+
+
+def assert_lands(mean, covariance, variance=VARIANCE, atol=1e-9, rtol=0.05):
+    assert torch.allclose(mean, MEAN, atol=atol)
+    assert torch.allclose(covariance, variance, rtol=rtol, atol=1e-9)
+
+
+def most_wrong(how):
+    """How far a variance may be off after 100 steps. Every first-order solver leaves too little, DDPM least of all."""
+    return {"heun": 1e-3, "ddpm": 0.12}.get(how["solver"], 0.05)
+
+
+@pytest.mark.parametrize("how", HOW, ids=lambda how: "-".join(str(x) for x in how.values()))
+def test_each_solver_lands_on_the_right_mean_and_variance(how):
+    denoise = gaussian_velocity(MEAN, VARIANCE, causal=True)
+    for kind in ("full", "fss"):
+        assert_lands(*moments(denoise, schedule_matrix(4, 100, 10, kind=kind), **how), rtol=most_wrong(how))
+
+
+@pytest.mark.parametrize("how", HOW, ids=lambda how: "-".join(str(x) for x in how.values()))
+def test_each_solver_keeps_correlation_and_its_error_falls_with_the_step(how):
+    denoise, errors = gaussian_velocity(MEAN, COVARIANCE), []
+    for num_steps in (30, 60):
+        mean, covariance = moments(denoise, schedule_matrix(4, num_steps, num_steps // 3), **how)
+        assert torch.allclose(mean, MEAN, atol=1e-9)
+        errors.append((covariance - COVARIANCE).abs().max().item())
+    # Half the step: half the error, or with Heun a quarter.
+    assert errors[1] < most_wrong(how) and errors[1] < (0.3 if how["solver"] == "heun" else 0.6) * errors[0]
+
+
+def vp(t):
+    """The signal and noise of the variance-preserving path that match flow time t."""
+    scale = (t**2 + (1 - t) ** 2).sqrt()
+    return (t / scale).unsqueeze(-1), ((1 - t) / scale).unsqueeze(-1)
+
+
+def trap_step(z_t, v, t_from, t_to, eta, fresh):
+    """The right step's formula with the variance-preserving path's coefficients, on latents of the flow."""
+    (a, b), (a_to, b_to) = vp(t_from), vp(t_to)
+    new = eta * (b_to / b) * (1 - (a / a_to) ** 2).clamp_min(0).sqrt()
+    eps = velocity_to_noise(z_t, v, t_from)
+    step = a_to * (z_t - b * eps) / a.clamp_min(1e-3) + (b_to**2 - new**2).clamp_min(0).sqrt() * eps
+    return torch.where(t_from[..., None] != t_to[..., None], step + (new * fresh if eta else 0), z_t)
+
+
+@pytest.mark.parametrize("solver", ["ddim", "ddpm"])
+def test_vp_coefficients_on_flow_latents_are_the_trap(monkeypatch, solver):
+    monkeypatch.setattr(sampling, "ddim_step", trap_step)
+    landed = moments(gaussian_velocity(MEAN, VARIANCE, causal=True), schedule_matrix(4, 100, 10), solver=solver)
+    with pytest.raises(AssertionError):
+        assert_lands(*landed)
+    with pytest.raises(AssertionError):  # nor is it a matter of a few percent
+        assert_lands(*landed, atol=0.1, rtol=0.3)
+
+
+@pytest.mark.parametrize("path", ["flow", "ddpm"])
+def test_ddpm_is_the_textbook_posterior_on_its_own_path(path):
+    """Ho et al. 2020, Eq. 7, on x = s z_t: another state, other coefficients, the same motion."""
+    matrix, start = schedule_matrix(4, 7, 2), noise(2, 4, 3)
+    t = level_to_time(torch.from_numpy(matrix).double(), 7, path)  # (M,N)
+    steps = list(sample_steps(wavy, matrix, start, solver="ddpm", path=path, generator=seeded(3)))
+    x, generator = start, seeded(3)
+    for row in range(1, len(matrix)):
+        fresh = torch.randn(x.shape, generator=generator, dtype=x.dtype)
+        for n in np.flatnonzero(matrix[row] != matrix[row - 1]):
+            (a, b), (a_to, b_to) = vp(t[row - 1, n]), vp(t[row, n])
+            alpha = (a / a_to) ** 2
+            x_n, scale = x[:, n], a + b
+            v = wavy(x_n / scale, t[row - 1, n].expand(2))
+            data = (x_n - b * (x_n / scale - t[row - 1, n] * v)) / a if a > 0 else x_n + v
+            mean = (a_to * (1 - alpha) * data + alpha.sqrt() * b_to**2 * x_n) / b**2
+            x = x.clone()
+            x[:, n] = mean + (b_to**2 / b**2 * (1 - alpha)).sqrt() * fresh[:, n]
+        a, b = vp(t[row])
+        torch.testing.assert_close(steps[row].z, x / (a + b), rtol=1e-9, atol=1e-9)
+    assert (steps[-1].z - start).abs().min() > 1e-6
+
+
+def wavy(z_t, t):
+    return torch.sin(3 * z_t) + t.unsqueeze(-1)
+
+
+def seeded(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_ddim_without_new_noise_is_euler_and_the_seed_decides_the_rest():
+    matrix, start = schedule_matrix(4, 6, 2), noise(2, 4, 3)
+    assert torch.equal(sample(wavy, matrix, start, solver="ddim"), sample(wavy, matrix, start))
+    one, same, other = (sample(wavy, matrix, start, solver="ddpm", generator=seeded(s)) for s in (1, 1, 2))
+    assert torch.equal(one, same) and (one - other).abs().min() > 1e-6
+    stochastic = sample(wavy, matrix, start, solver="ddim", eta=1.0, generator=seeded(1))
+    assert torch.equal(one, stochastic)
+
+
+def test_heun_asks_twice_a_row_and_the_others_once():
+    matrix, calls = schedule_matrix(3, 4, 2), []
+    for solver in SOLVERS:
+        sample(lambda z_t, t: calls.append(1) or z_t, matrix, noise(2, 3, 1), solver=solver, generator=seeded(0))
+        assert len(calls) == (2 if solver == "heun" else 1) * (len(matrix) - 1)
+        calls.clear()
+
+
+def test_a_row_in_which_nothing_moves_costs_nothing():
+    matrix, calls = np.array([[2, 2], [1, 2], [1, 2], [0, 1], [0, 0]]), []
+    steps = list(sample_steps(lambda z_t, t: calls.append(1) or z_t, matrix, noise(1, 2, 1)))
+    assert len(calls) == 3 and torch.equal(steps[1].z, steps[2].z)
+
+
+@pytest.mark.parametrize(
+    "how, said",
+    [
+        (dict(solver="rk4"), "euler, heun"),
+        (dict(path="ve"), "'flow' or 'ddpm'"),
+        (dict(solver="ddim", eta=1.5), "between 0 and 1"),
+        (dict(solver="ddim", eta=float("nan")), "between 0 and 1"),
+        (dict(solver="heun", eta=0.5), "belongs to the solver ddim"),
+        (dict(solver="ddpm"), "generator"),
+    ],
+)
+def test_what_a_solver_refuses(how, said):
+    with pytest.raises(ValueError, match=said):
+        sample(wavy, schedule_matrix(3, 4), noise(1, 3, 1), **how)
+
+
+# --- the paper's own objective ---------------------------------------------------------------------------------------
+
+
+def gaussian_noise(x, time):
+    """E[eps | x] on the variance-preserving path at level k = K (1 - time), latent by latent."""
+    angle = (1 - time + 0.008) / 1.008 * torch.pi / 2  # as the cosine schedule is usually written
+    signal = (torch.cos(angle) / np.cos(0.008 / 1.008 * np.pi / 2)).unsqueeze(-1)  # (B,N,1)
+    mean, variance = (y[: x.shape[1], None] for y in (MEAN, VARIANCE.diagonal()))
+    return (1 - signal**2).sqrt() * (x - signal * mean) / (signal**2 * variance + 1 - signal**2)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_model_of_noise_lands_there_too(solver):
+    denoise = from_noise_prediction(gaussian_noise)
+    for kind in ("full", "fss"):
+        landed = moments(denoise, schedule_matrix(4, 100, 10, kind=kind), solver=solver, path="ddpm")
+        # Not exact: pure noise is read as if a little of it were signal.
+        assert_lands(*landed, atol=2e-3, rtol=most_wrong({"solver": solver}))
+
+
+def test_a_model_of_noise_is_asked_at_its_own_levels_on_its_own_path():
+    seen = []
+
+    def predict(x, time):
+        seen.append((x, time))
+        return 0.5 * x
+
+    start = noise(1, 2, 3)
+    list(sample_steps(from_noise_prediction(predict), schedule_matrix(2, 50, 50), start, path="ddpm"))
+    levels = [1000 * (1 - time[0, -1].item()) for _, time in seen]
+    assert np.allclose(levels[:50], [990, *range(980, 0, -20)]) and np.allclose(levels[50:], levels[:50])
+    assert torch.equal(seen[0][0], start[:, :1]) and (seen[50][1][0, 0] == 1).all()  # unit variance; k = 0 when done
+
+    # A wrong prediction of pure noise moves the first step little: without the floor it would be blown up.
+    once = [x for x, _ in seen]
+    assert (once[1] - once[0]).abs().max() < 5 * start.abs().max()
 
 
 # --- causality of the whole sampler ---------------------------------------------------------------------------------
@@ -118,10 +303,15 @@ def test_words_said_later_do_not_move_earlier_samples():
 # --- who moves ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_waiting_and_finished_latents_do_not_move_a_bit_and_the_others_do(kind):
+def test_waiting_and_finished_latents_do_not_move_a_bit_and_the_others_do(kind, solver):
     matrix = schedule_matrix(5, 6, 2, 2, kind)
-    steps = list(sample_steps(lambda z_t, t: torch.sin(z_t) + 0.1, matrix, noise(2, 5, 3)))
+
+    def denoise(z_t, t):  # a finished latent says nonsense
+        return torch.where(t.unsqueeze(-1) < 1, torch.sin(z_t) + 0.1, torch.nan if solver != "heun" else 7.0)
+
+    steps = list(sample_steps(denoise, matrix, noise(2, 5, 3), solver=solver, generator=seeded(0)))
     assert len(steps) == len(matrix) and [step.row for step in steps] == list(range(len(matrix)))
     for before, after in zip(steps, steps[1:]):
         moves = torch.from_numpy(matrix[after.row] != matrix[before.row])
@@ -167,12 +357,13 @@ def test_hiding_the_waiting_latents_changes_nothing_under_a_causal_mask():
     torch.testing.assert_close(hidden, sample(everything, matrix, start), rtol=1e-9, atol=1e-9)
 
 
-def test_a_prefix_stays_and_is_looked_at():
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_a_prefix_stays_and_is_looked_at(solver):
     model, matrix = randomise(CausalDiT(TINY)), schedule_matrix(4, 4, 2)
     denoise = guided(model, *text(1, 6, 3), None, None, 1.0)
     prefix = noise(1, 2, 3, seed=5)
-    out = sample(denoise, matrix, noise(1, 4, 3), prefix)
-    other = sample(denoise, matrix, noise(1, 4, 3), prefix + 1)
+    out = sample(denoise, matrix, noise(1, 4, 3), prefix, solver=solver, generator=seeded(0))
+    other = sample(denoise, matrix, noise(1, 4, 3), prefix + 1, solver=solver, generator=seeded(0))
     assert out.shape == (1, 6, 3) and torch.equal(out[:, :2], prefix)
     assert ((out - other)[:, 2:].abs().amax(-1) > 1e-6).all()
     seen = []

@@ -1,12 +1,22 @@
-"""One sampler for every scheduling matrix, and classifier-free guidance (CMDM Alg. 2 as a flow).
+"""One sampler for every scheduling matrix, four step rules, and classifier-free guidance (CMDM Alg. 2).
 
 The matrix says all there is to say about order: row m gives each latent's noise level, and going to row
-m+1 is one call of the denoiser and one Euler step of the latents whose level changes. Full-sequence,
+m+1 is one call of the denoiser and one step of the latents whose level changes. Full-sequence,
 autoregressive and frame-wise (FSS) sampling are the same loop over different matrices.
 
-CMDM's Alg. 2 prints a stochastic DDPM step and, read literally, would also step latents that wait (level
-K) or are finished (level 0). The released code takes deterministic Euler steps and leaves those alone,
-and so do we.
+The solver says how far a step trusts the denoiser:
+
+    "euler"  straight on along the velocity. The release's, and the default
+    "heun"   along the mean of the velocities at both ends of the step. Two calls a row; its error falls with the square
+             of the step
+    "ddim"   to the predicted data and back. With eta = 0 that is the Euler step again; with more, some noise is new
+    "ddpm"   the same with eta = 1: the ancestral step of CMDM Alg. 2
+
+and the path says which times the levels stand for: "flow" t = 1 - k/K, "ddpm" the paper's cosine. Any solver goes with
+any path, as the state is always z_t of diffusion/path.py: two paths that match in signal-to-noise are one.
+
+CMDM's Alg. 2, read literally, would also step latents that wait (level K) or are finished (level 0). The released
+code leaves those alone, and so do we, whatever the solver.
 """
 
 from collections.abc import Callable, Iterator
@@ -16,17 +26,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from minicmdm.diffusion.path import euler_step, level_to_time, velocity_to_data
+from minicmdm.diffusion.path import (
+    DDPM_LEVELS,
+    cosine_alpha_bar,
+    cosine_fraction,
+    ddim_step,
+    euler_step,
+    flow_to_ddpm,
+    level_to_time,
+    time_to_alpha_bar,
+    velocity_to_data,
+)
 from minicmdm.diffusion.schedules import check_matrix
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # (z_t (B,N,C), t (B,N)) -> velocity (B,N,C)
+SOLVERS = ("euler", "heun", "ddpm", "ddim")
+NOISIEST = 0.99  # of K: the noisiest level at which a prediction of noise is turned into data
 
 
 @dataclass
 class SampleStep:
-    """A moment of sampling, for films and streams: the state after `row` calls."""
+    """A moment of sampling, for films and streams: the state after `row` steps."""
 
-    row: int  # 0 is the noise before any call
+    row: int  # 0 is the noise before any step
     levels: np.ndarray  # (N,) noise levels
     z: Tensor  # (B,N,C)
     t: Tensor  # (B,N) flow times of z
@@ -35,7 +57,15 @@ class SampleStep:
 
 
 def sample_steps(
-    denoise: Denoise, matrix: np.ndarray, noise: Tensor, prefix: Tensor | None = None
+    denoise: Denoise,
+    matrix: np.ndarray,
+    noise: Tensor,
+    prefix: Tensor | None = None,
+    *,
+    solver: str = "euler",
+    path: str = "flow",
+    eta: float = 0.0,
+    generator: torch.Generator | None = None,
 ) -> Iterator[SampleStep]:
     """Yield the state at every row of the matrix (M,N), starting from noise (B,N,C).
 
@@ -43,9 +73,13 @@ def sample_steps(
     nothing after it. Under a causal mask that changes no number and saves half of the work.
     A prefix (B,P,C) of finished latents is put in front: it is at level 0 throughout, never moves, and is
     part of every z that is yielded. For a model with blocks, P should be a multiple of the block size.
-    ValueError: the matrix is not a schedule, or its columns are not the noise's latents.
+    solver, path: see the top of the file. eta in [0,1] is read by "ddim" alone, and is 1 for "ddpm". Whoever draws new
+    noise needs the generator.
+    ValueError: the matrix is not a schedule, its columns are not the noise's latents, an unknown solver or path, an eta
+    outside [0,1] or for a solver that has none, or new noise and no generator.
     """
     matrix = check_matrix(matrix)
+    eta = _check_solver(solver, eta, generator)
     num_steps = int(matrix[0, 0])  # K
     if noise.ndim != 3 or noise.shape[1] != matrix.shape[1]:
         raise ValueError(
@@ -57,24 +91,84 @@ def sample_steps(
         z = torch.cat([prefix.to(noise), noise], dim=1)  # (B,P+N,C)
         matrix = np.concatenate([np.zeros((len(matrix), prefix.shape[1]), np.int64), matrix], axis=1)
     levels = torch.from_numpy(matrix).to(z.device)
-    times = level_to_time(levels.to(z.dtype), num_steps).unsqueeze(1).expand(-1, len(z), -1)  # (M,B,N)
-    yield SampleStep(0, matrix[0], z, times[0], None)
+    times = level_to_time(levels.to(z.dtype), num_steps, path).unsqueeze(1).expand(-1, len(z), -1)  # (M,B,N)
+    clean = None
+    yield SampleStep(0, matrix[0], z, times[0], clean)
     for row in range(1, len(matrix)):
-        # Columns start from left to right, so whatever lies right of the last mover is waiting (or finished).
-        seen = int(np.flatnonzero(matrix[row] != matrix[row - 1])[-1]) + 1
-        v = denoise(z[:, :seen], times[row - 1][:, :seen])  # (B,seen,C)
-        v = torch.cat([v, torch.zeros_like(z[:, seen:])], dim=1)  # (B,N,C)
-        clean = velocity_to_data(z, v, times[row - 1])
-        z = euler_step(z, v, times[row - 1], times[row])
-        yield SampleStep(row, matrix[row], z, times[row], clean)
+        before, after = times[row - 1], times[row]
+        moving = np.flatnonzero(matrix[row] != matrix[row - 1])
+        if len(moving):  # a row in which nothing moves costs nothing
+            # Columns start from left to right, so whatever lies right of the last mover is waiting (or finished).
+            seen = int(moving[-1]) + 1
+            v = _velocity(denoise, z, before, seen)
+            clean = velocity_to_data(z, v, before)
+            if solver == "heun":
+                v = (v + _velocity(denoise, euler_step(z, v, before, after), after, seen)) / 2
+            fresh = None
+            if eta:
+                fresh = torch.randn(z.shape, generator=generator, dtype=z.dtype, device=generator.device).to(z.device)
+            z = ddim_step(z, v, before, after, eta, fresh)  # Euler's, when eta is 0
+        yield SampleStep(row, matrix[row], z, after, clean)
+
+
+def _velocity(denoise: Denoise, z: Tensor, t: Tensor, seen: int) -> Tensor:
+    v = denoise(z[:, :seen], t[:, :seen])  # (B,seen,C)
+    return torch.cat([v, torch.zeros_like(z[:, seen:])], dim=1)  # (B,N,C)
+
+
+def _check_solver(solver: str, eta: float, generator: torch.Generator | None) -> float:
+    if solver not in SOLVERS:
+        raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}")
+    if not 0 <= eta <= 1:
+        raise ValueError(f"eta is the share of new noise, between 0 and 1, got {eta!r}")
+    if eta and solver != "ddim":
+        raise ValueError(f"eta belongs to the solver ddim, {solver} has none (ddpm is ddim with eta = 1)")
+    eta = 1.0 if solver == "ddpm" else float(eta)
+    if eta and generator is None:
+        raise ValueError(f"the solver {solver} draws new noise at every step: give it a generator")
+    return eta
 
 
 @torch.no_grad()
-def sample(denoise: Denoise, matrix: np.ndarray, noise: Tensor, prefix: Tensor | None = None) -> Tensor:
-    """Run the matrix (M,N) to its end: noise (B,N,C) -> clean latents (B,N,C), or (B,P+N,C) with a prefix."""
-    for step in sample_steps(denoise, matrix, noise, prefix):  # noqa: B007  the last step is the answer
+def sample(
+    denoise: Denoise,
+    matrix: np.ndarray,
+    noise: Tensor,
+    prefix: Tensor | None = None,
+    *,
+    solver: str = "euler",
+    path: str = "flow",
+    eta: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Run the matrix (M,N) to its end: noise (B,N,C) -> clean latents (B,N,C), or (B,P+N,C) with a prefix.
+
+    The arguments are those of `sample_steps`.
+    """
+    steps = sample_steps(denoise, matrix, noise, prefix, solver=solver, path=path, eta=eta, generator=generator)
+    for step in steps:  # noqa: B007  the last step is the answer
         pass
     return step.z
+
+
+def from_noise_prediction(predict: Denoise) -> Denoise:
+    """Turn a model of the paper's objective into a denoiser: (x, 1 - k/1000) -> eps becomes (z_t, t) -> velocity.
+
+    `predict` is bound to its text (`guided` will do: guiding eps and guiding v are the same) and was trained with
+    `diffusion_forcing_loss(path="ddpm")`. It works with every solver; path="ddpm" visits the levels it knows.
+    At pure noise a prediction of eps says nothing of the data: z = (x - sqrt(1 - abar) eps) / sqrt(abar) is 0/0 there,
+    and near it any error of eps is blown up. So the last hundredth of the levels is read as if it were NOISIEST K,
+    where 1.6 % of x is signal.
+    """
+
+    def denoise(z_t: Tensor, t: Tensor) -> Tensor:
+        level = (DDPM_LEVELS * cosine_fraction(time_to_alpha_bar(t))).round().clamp(0, NOISIEST * DDPM_LEVELS)  # (B,N)
+        alpha_bar = cosine_alpha_bar(level / DDPM_LEVELS).unsqueeze(-1)  # (B,N,1)
+        x = flow_to_ddpm(z_t, t)
+        eps = predict(x, 1 - level / DDPM_LEVELS)
+        return (x - (1 - alpha_bar).sqrt() * eps) / alpha_bar.sqrt() - eps
+
+    return denoise
 
 
 def guided(
