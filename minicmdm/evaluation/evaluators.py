@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,21 +21,24 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence, pad_sequence
 
 from minicmdm.config import Preset
-from minicmdm.data.dataset import MotionDataset
+from minicmdm.data import grammar
+from minicmdm.data.dataset import Clip, MotionDataset
 from minicmdm.data.features import NUM_FEATURES
+from minicmdm.data.programs import HELDOUT_PAIRS, OVERLAYS, SIDES, Program, pairs_of
 from minicmdm.evaluation.metrics import r_precision
 from minicmdm.files import write_text
 from minicmdm.models.layers import sinusoid
 from minicmdm.models.tmr import MAX_SCALE, contrastive_loss
-from minicmdm.training.batches import draw_captioned
+from minicmdm.training.batches import POOL
 from minicmdm.training.checkpoints import checksum, load_tensors, load_weights, save_tensors
 from minicmdm.training.loop import LoopConfig, LoopResult, fit, step_key
 
 FORMAT = "minicmdm-bench-1"
 ESSENTIAL = 67  # root and joint positions, the first of the 263: all that a skeleton is drawn from (MARDM)
 GROUP, SLOPE = 4, 0.2  # frames a token; LeakyReLU's, as in T2M
-UNKNOWN = 0  # place of every word outside the vocabulary; the padding, never read, is the same
-LAYERS, HEADS, DROPOUT = 2, 4, 0.1  # of the transformers; of both kinds
+PADDING, UNKNOWN, FIRST = 0, 1, 2  # places in the vocabulary
+LAYERS, HEADS = 2, 4  # of the transformers
+DROPOUT = 0.1  # of what enters a reader; inside the transformer it drowns the order of the words
 WORD = re.compile(r"\w+")  # what stands between spaces and punctuation
 FORGET = 0.05  # how often a word is hidden in training, so that the unknown one means "some word"
 
@@ -78,15 +81,17 @@ class TransformerReader(nn.Module):
 
     def __init__(self, cfg: EvaluatorConfig):
         super().__init__()
-        sizes = cfg.width, HEADS, 2 * cfg.width, DROPOUT
-        layer = nn.TransformerEncoderLayer(*sizes, F.gelu, batch_first=True, norm_first=True)
+        sizes = cfg.width, HEADS, 2 * cfg.width
+        layer = nn.TransformerEncoderLayer(*sizes, 0.0, F.gelu, batch_first=True, norm_first=True)
         self.token = nn.Parameter(0.1 * torch.randn(1, 1, cfg.width))
         self.layers = nn.TransformerEncoder(layer, LAYERS, nn.LayerNorm(cfg.width), enable_nested_tensor=False)
         self.head = nn.Linear(cfg.width, cfg.embed_dim)
 
     def forward(self, x: Tensor, lengths: Tensor) -> Tensor:
         x = torch.cat([self.token.expand(len(x), -1, -1), x], dim=1)  # (B,N,width) -> (B,1+N,width)
-        x = x + sinusoid(torch.arange(x.shape[1], device=x.device, dtype=x.dtype), x.shape[2])
+        waves = sinusoid(torch.arange(x.shape[1], device=x.device, dtype=x.dtype), 3 * x.shape[2]).chunk(2, dim=-1)
+        # The quicker third of the waves: the others hardly move over fifty tokens, and order is learnt too late.
+        x = x + torch.cat([wave[:, : x.shape[2] // 2] for wave in waves], dim=-1)  # (1+N,width)
         x = self.layers(x, src_key_padding_mask=_after(1 + lengths, x.shape[1]))
         return F.normalize(self.head(x[:, 0]), dim=-1)
 
@@ -99,10 +104,10 @@ class Evaluator(nn.Module):
         if cfg.kind not in ("t2m", "clip") or cfg.dims not in (NUM_FEATURES, ESSENTIAL) or cfg.width % (2 * HEADS):
             raise ValueError(f"expected 't2m' or 'clip', 263 or 67 dims, a width that {2 * HEADS} divides, got {cfg}")
         self.cfg, self.words = cfg, list(words)
-        self.places = {word: place for place, word in enumerate(self.words, start=UNKNOWN + 1)}
+        self.places = {word: place for place, word in enumerate(self.words, start=FIRST)}
         self.register_buffer("mean", torch.zeros(cfg.dims))
         self.register_buffer("std", torch.ones(cfg.dims))
-        self.embed_words = nn.Embedding(UNKNOWN + 1 + len(self.words), cfg.width)
+        self.embed_words = nn.Embedding(FIRST + len(self.words), cfg.width, PADDING)
         if cfg.kind == "t2m":
             down = [nn.Conv1d(cfg.dims, cfg.width, 4, 2, 1), nn.Conv1d(cfg.width, cfg.width, 4, 2, 1)]
         else:
@@ -147,6 +152,39 @@ def _after(lengths: Tensor, size: int) -> Tensor:
     return torch.arange(size, device=lengths.device) >= lengths[:, None]  # (B,size): True past the end
 
 
+def near_miss(program: Program, rng: np.random.Generator) -> Program | None:
+    """Two neighbours exchanged, half the time, or one stated field changed; None where there is neither."""
+    values = {"side": SIDES, "direction": SIDES, "speed": ("slow", "fast"), "count": (1, 2, 3), "overlay": OVERLAYS}
+    swaps = [(*program[:i], *program[i : i + 2][::-1], *program[i + 2 :]) for i in range(len(program) - 1)]
+    swaps = [p for p in swaps if p != program and not HELDOUT_PAIRS.intersection(pairs_of(p))]
+    stated = [(i, f) for i, segment in enumerate(program) for f in values if getattr(segment, f) in values[f]]
+    if swaps and (not stated or rng.random() < 0.5):
+        return swaps[rng.integers(len(swaps))]
+    if not stated:
+        return None
+    i, field = stated[rng.integers(len(stated))]
+    others = [value for value in values[field] if value != getattr(program[i], field)]
+    changed = replace(program[i], **{field: others[rng.integers(len(others))]})
+    return (*program[:i], changed, *program[i + 1 :])
+
+
+def draw_pairs(
+    data: MotionDataset, count: int, generator: torch.Generator
+) -> tuple[list[Clip], list[str], list[str], list[int]]:
+    """Draw `count` clips, a caption of each, and near misses: captions that say one thing wrong, and of which clip.
+
+    The clips are alike in length, so that no length alone gives a pair away.
+    """
+    pool = torch.randperm(len(data), generator=generator)[: POOL * count].tolist()
+    pool.sort(key=lambda i: len(data.clips[i].features))
+    slot = int(torch.randint(max(1, len(pool) // count), (), generator=generator))
+    clips = [data.clips[i] for i in pool[slot * count : (slot + 1) * count]]
+    rng = np.random.default_rng(int(torch.randint(2**31, (), generator=generator)))
+    misses = {i: near_miss(clip.program or (), rng) for i, clip in enumerate(clips)}
+    misses = {i: grammar.caption(rng, miss) for i, miss in misses.items() if miss}
+    return clips, [clip.captions[rng.integers(len(clip.captions))] for clip in clips], [*misses.values()], [*misses]
+
+
 def train_evaluator(
     cfg: EvaluatorConfig,
     train_set: MotionDataset,
@@ -163,20 +201,25 @@ def train_evaluator(
     """Learn which sentence belongs to which motion; `ema["evaluator"]` of the result is the judge.
 
     T2M pushes each motion from one wrong sentence, that of a neighbour in the batch; here from all at once (InfoNCE),
-    save those that say the same. A batch's motions are alike in length, so that no length alone gives a pair away.
+    and from a near miss, without which counts and order hardly ever decide and the judge is deaf to them.
     """
     own = step_key(seed, -4)  # not the teacher's seed, hence another order of the data
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(own)
         said = " ".join(text for clip in train_set.clips for text in clip.captions).lower()
         judge = Evaluator(cfg, sorted(set(WORD.findall(said))))
-    mean, std = torch.from_numpy(train_set.mean).float(), torch.from_numpy(train_set.std).float()
-    judge.mean, judge.std = mean[: cfg.dims].clone(), std[: cfg.dims].clone()
+    judge.mean.copy_(torch.from_numpy(train_set.mean[: cfg.dims]))
+    judge.std.copy_(torch.from_numpy(train_set.std[: cfg.dims]))
 
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        x, valid, texts, same = draw_captioned(train_set, batch, generator)
-        motion, text = judge.motion(x * std + mean, valid.sum(1)), judge.sentences(texts)  # (B,E) each
-        return contrastive_loss(judge.similarity(motion, text), same), {}
+        clips, texts, misses, whose = draw_pairs(train_set, batch, generator)
+        said = [clip.program or text for clip, text in zip(clips, texts)]
+        same = torch.tensor([[a == b for b in said] for a in said])  # not wrong answers, if not right ones
+        motion, text = judge.motion(*_stack([clip.features for clip in clips])), judge.sentences(texts + misses)
+        closeness = judge.similarity(motion, text)  # (B,B+M)
+        right, wrong = closeness.diagonal()[whose], closeness[whose, len(clips) + torch.arange(len(whose))]  # (M,) each
+        value = contrastive_loss(closeness[:, : len(clips)], same) + F.softplus(wrong - right).sum() / len(clips)
+        return value, {"near_misses": float((wrong < right).sum()) / max(1, len(whose))}  # the share refused
 
     def validate(ema: nn.ModuleDict) -> dict[str, float]:
         pairs = embed(ema["evaluator"], [c.captions[0] for c in val_set.clips], [c.features for c in val_set.clips])
@@ -204,14 +247,18 @@ def train_bench(
     return LoopResult(nn.ModuleDict({"evaluator": judges}), metrics, seconds)
 
 
+def _stack(motions: list[np.ndarray], device: torch.device | None = None) -> tuple[Tensor, Tensor]:
+    x = [torch.as_tensor(motion, dtype=torch.float32, device=device) for motion in motions]
+    return pad_sequence(x, batch_first=True), torch.tensor([len(motion) for motion in motions])  # (B,T,263), (B,)
+
+
 @torch.no_grad()
 def embed(judge: Evaluator, sentences: list[str], motions: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Text (N,E) and motion (M,E) embeddings, float64, of sentences and of raw features, one (T,263) a motion."""
     order = np.argsort([len(x) for x in motions], kind="stable")
     out = np.zeros((len(order), judge.cfg.embed_dim))
     for chosen in np.array_split(order, -(-len(order) // 64)):  # motions of like length together
-        x = [torch.as_tensor(motions[i], dtype=torch.float32, device=judge.mean.device) for i in chosen]
-        out[chosen] = judge.motion(pad_sequence(x, batch_first=True), torch.tensor([len(row) for row in x])).cpu()
+        out[chosen] = judge.motion(*_stack([motions[i] for i in chosen], judge.mean.device)).cpu()
     return judge.sentences(sentences).cpu().double().numpy(), out
 
 
