@@ -64,6 +64,7 @@ class DiTConfig:
     time_dim: int = 256
     block_size: int = 1  # latents that see each other both ways: 1 is the paper's text, 3 the released code
     attention: str = "causal"  # or "bidirectional"
+    text_layers: int = 0  # self-attention among the words of a sentence before latents see them (ours)
     clock: bool = False  # True (ours): each latent knows how far into its sentence it is, and what is left if known
 
     @property
@@ -179,7 +180,7 @@ PRESETS = {
         vae=VAEConfig(latent_dim=16, width=128, depth=2),
         text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64),
         tmr=TMRConfig(dim=48, layers=2, heads=1, embed_dim=64, dropout=0.0),
-        dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4, clock=True),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4, text_layers=2, clock=True),
         train=TrainConfig(
             bfloat16=True,
             evaluator_steps=1_500,
@@ -195,7 +196,7 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=8_000,
+            dit_steps=6_500,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
@@ -209,7 +210,7 @@ PRESETS = {
         vae=VAEConfig(latent_dim=16, width=64, depth=2),
         text=TextConfig(dim=96, layers=2, heads=4, vocab_size=512, max_words=64),
         tmr=TMRConfig(dim=48, layers=2, heads=1, embed_dim=64, dropout=0.0),
-        dit=DiTConfig(latent_dim=16, text_dim=96, dim=64, layers=4, heads=2, clock=True),
+        dit=DiTConfig(latent_dim=16, text_dim=96, dim=64, layers=4, heads=2, text_layers=2, clock=True),
         train=TrainConfig(
             bfloat16=True,
             tmr_steps=400,

@@ -157,3 +157,20 @@ def test_unknown_attention_and_block_size():
         CausalDiT(replace(TINY, attention="sideways"))
     with pytest.raises(ValueError, match="block_size"):
         CausalDiT(replace(TINY, block_size=0))
+
+
+def test_words_read_their_own_sentence_only():
+    """Two sentences side by side: no word of one, nor padding that nobody sees, changes how the other is read."""
+    model = randomise(CausalDiT(replace(TINY, text_layers=2, attention="bidirectional", layers=1)))
+    z_t, t, words, mask = inputs(latents=4, words=7)
+    mask[:] = False
+    mask[:, :2, :3] = mask[:, 2:, 3:6] = True  # the seventh word is padding
+    keys = torch.cat([k.transpose(1, 2).flatten(2) for k, _ in model.read_words(words, mask)], -1)
+    assert keys.shape == (1, 7, TINY.dim)
+    seen = dependencies(lambda w: model.read_words(w, mask)[0][0].transpose(1, 2).flatten(2), words)
+    expected = torch.zeros(7, 7, dtype=torch.bool)
+    expected[:3, :3] = expected[3:6, 3:6] = True
+    expected[6, 6] = True
+    assert torch.equal(seen, expected)
+    alone = model.read_words(words[:, 3:6])[0][1]  # as a stream reads one prompt: no mask, nothing before it
+    torch.testing.assert_close(model.read_words(words, mask)[0][1][:, :, 3:6], alone, rtol=1e-9, atol=1e-9)

@@ -133,6 +133,25 @@ class Block(nn.Module):
         return x + gate2 * self.feedforward(modulate(self.norm3(x), shift2, scale2))
 
 
+class WordBlock(nn.Module):
+    """Words look at the words of their own sentence: who turns, to which side, how often. (B,S,dim) -> (B,S,dim).
+
+    A text encoder learnt by contrast and then frozen need only say which sentence is whose, and hardly tells which word
+    goes with which; the denoiser has to know. The paper reads a frozen DistilBERT's words as they are.
+    """
+
+    def __init__(self, dim: int, heads: int, feedforward_dim: int):
+        super().__init__()
+        self.norm1, self.attention = nn.LayerNorm(dim), Attention(dim, heads)
+        self.norm2 = nn.LayerNorm(dim)
+        self.feedforward = nn.Sequential(nn.Linear(dim, feedforward_dim), nn.GELU(), nn.Linear(feedforward_dim, dim))
+
+    def forward(self, x: Tensor, mask: Tensor | None, positions: Tensor) -> Tensor:
+        h = self.norm1(x)
+        x = x + self.attention(h, h, mask, positions)
+        return x + self.feedforward(self.norm2(x))
+
+
 class CausalDiT(nn.Module):
     """Noisy latents, their times and the words they may see -> velocity (CMDM Eq. 7, as a flow)."""
 
@@ -145,6 +164,9 @@ class CausalDiT(nn.Module):
         self.cfg = cfg
         self.embed_latent = nn.Linear(cfg.latent_dim, cfg.dim)
         self.embed_words = nn.Linear(cfg.text_dim, cfg.dim)
+        self.word_blocks = nn.ModuleList(
+            WordBlock(cfg.dim, cfg.heads, cfg.feedforward_dim) for _ in range(cfg.text_layers)
+        )
         if cfg.clock:
             self.embed_clock = nn.Linear(2 * CLOCK_DIM + 1, cfg.dim)
         # AdaLN is SiLU and linear in every block; the SiLU is the same for all of them, so it is done here, once.
@@ -183,7 +205,9 @@ class CausalDiT(nn.Module):
         levels, which = t.unique(return_inverse=True)  # (U,), and for every latent its place there (B,N)
         told = clock_features(t, clock) if self.cfg.clock else None
         modulations = self.modulations(levels)
-        return self.evaluate(z_t, which, modulations, self.read_words(words), word_mask, mask, positions, told)
+        return self.evaluate(
+            z_t, which, modulations, self.read_words(words, word_mask), word_mask, mask, positions, told
+        )
 
     def modulations(self, levels: Tensor) -> list[Tensor]:
         """What every block makes of the times (U,): its six modulation vectors, (U,6*dim) each."""
@@ -194,9 +218,18 @@ class CausalDiT(nn.Module):
         time = self.embed_time(waves)  # (U,time_dim) -> (U,dim)
         return [block.modulation(time) for block in self.blocks]
 
-    def read_words(self, words: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each."""
+    def read_words(self, words: Tensor, word_mask: Tensor | None = None) -> list[tuple[Tensor, Tensor]]:
+        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each.
+
+        Two words belong together if some latent sees both by word_mask (B,N,S); without it all of a row's do.
+        """
+        together = None
+        if word_mask is not None and len(self.word_blocks):
+            seen = word_mask.to(words.dtype)
+            together = seen.transpose(1, 2) @ seen > 0  # (B,N,S) -> (B,S,S)
         words = self.embed_words(words)  # (B,S,E) -> (B,S,dim)
+        for block in self.word_blocks:
+            words = block(words, together, torch.arange(words.shape[1], device=words.device))
         return [block.cross_attention.keys_values(words) for block in self.blocks]
 
     def evaluate(
