@@ -39,6 +39,8 @@ _HOME = {  # public name -> the module it lives in
     "diffusion_forcing_loss": "diffusion.forcing",
     "load_checkpoint": "training.checkpoints",
     "train": "training.stages",
+    "metrics": "evaluation.metrics",
+    "evaluate": "evaluation.protocols",
     "html_page": "viz.player",
     "pose_strip": "viz.plots",
     "save_gif": "viz.plots",
@@ -49,7 +51,8 @@ __all__ = ["__version__", *_HOME]
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module 'minicmdm' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"minicmdm.{_HOME[name]}"), name)
+    home = import_module(f"minicmdm.{_HOME[name]}")
+    value = globals()[name] = home if _HOME[name].endswith(f".{name}") else getattr(home, name)  # `metrics` is a module
     return value
 
 

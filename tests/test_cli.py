@@ -10,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-from minicmdm import cli
+from minicmdm import cli, commands
 from minicmdm.data.dataset import make_clip
 from minicmdm.data.features import features_to_joints
 
@@ -43,6 +43,7 @@ def here(tmp_path, monkeypatch, tiny_run, joints):
     (tmp_path / "boast.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
     (tmp_path / "folder.npy").mkdir()
     (tmp_path / "mine.npy").write_text("mine")
+    (tmp_path / "mine.json").write_text("mine")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("mine")
     shutil.copytree(tiny_run, "cut_checkpoint")
@@ -128,8 +129,18 @@ BAD = {
     "train data": (["train", "--out", "run", "--data", "full"], "train.txt"),
     "train seed": (["train", "--out", "run", "--seed", "-3"], "--seed"),
     "train threads": (["train", "--out", "run", "--threads", "0"], "--threads"),
-    "evaluate what": (["evaluate"], "--quick"),
     "evaluate limit": (["evaluate", "--quick", "--limit", "0"], "--limit"),
+    "evaluate too few": (["evaluate", "--limit", "31"], "at least 32"),
+    "evaluate protocol": (["evaluate", "--protocol", "t2v"], "t2m or recon"),
+    "evaluate judge": (["evaluate", "--evaluator", "tmr"], "t2m_essential"),
+    "evaluate never": (["evaluate", "--repeats", "0"], "repeats"),
+    "evaluate quickly and not": (["evaluate", "--quick", "--protocol", "t2m"], "leave out --protocol"),
+    "evaluate a quick table": (["evaluate", "--quick", "--table"], "leave out --table"),
+    "evaluate in two forms": (["evaluate", "--table", "--json"], "not allowed with"),
+    "evaluate over": (["evaluate", "--out", "mine.json"], "--force"),
+    "evaluate nowhere": (["evaluate", "--out", "no/result.json"], "does not exist"),
+    "evaluate ending": (["evaluate", "--out", "result.csv"], ".json, .txt"),
+    "evaluate nobody": (["evaluate", "--checkpoint", "nowhere"], "nowhere"),
 }
 
 
@@ -263,10 +274,10 @@ def test_any_locale(here):
 
 
 def test_a_sentence_is_utf8_whatever_the_locale_made_of_it():
-    assert cli._as_typed("a persön") == "a persön"
+    assert commands._as_typed("a persön") == "a persön"
     escaped = "a persön".encode().decode("ascii", "surrogateescape")  # what LC_ALL=C hands to Python
-    assert cli._as_typed(escaped) == "a persön"
-    assert cli._as_typed("pers\udcf6n") == "pers\udcf6n"  # a Latin-1 byte: left for the pipeline to refuse
+    assert commands._as_typed(escaped) == "a persön"
+    assert commands._as_typed("pers\udcf6n") == "pers\udcf6n"  # a Latin-1 byte: left for the pipeline to refuse
 
 
 def test_demo_writes_a_player_and_a_gif_of_each_scene(tmp_path, capsys):

@@ -1,0 +1,202 @@
+"""What each command of the command line does, once its arguments are read. See cli.py for the habits all share."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+from pathlib import Path
+
+MOST_CELLS = 1_000_000  # of a printed matrix
+
+
+def say(line: str) -> None:
+    """One line for people. Characters that their terminal has no letter for are escaped, never fatal."""
+    encoding = getattr(sys.stderr, "encoding", None) or "ascii"
+    print("minicmdm: " + line.encode(encoding, "backslashreplace").decode(encoding), file=sys.stderr, flush=True)
+
+
+def _as_typed(argument: str) -> str:
+    """A sentence as UTF-8, even where the locale (LC_ALL=C) knows ASCII only and handed us escaped bytes."""
+    try:
+        return os.fsencode(argument).decode("utf-8")
+    except UnicodeError:
+        return argument
+
+
+def generate(arguments: argparse.Namespace) -> None:
+    """`minicmdm generate`: everything that can be refused is refused before the first step of sampling."""
+    from minicmdm.files import check_output
+    from minicmdm.motion import ENDINGS
+
+    prompt = _as_typed(arguments.prompt)
+    if not prompt.strip():
+        raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
+    out = check_output(arguments.out, ENDINGS, arguments.force)
+    _one_thread()
+    from minicmdm.pipeline import MotionPipeline
+
+    pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+    motion = pipe(
+        prompt,
+        num_frames=arguments.frames,
+        schedule=arguments.schedule,
+        num_steps=arguments.steps,
+        uncertainty=arguments.uncertainty,
+        guidance_scale=arguments.guidance,
+        block_size=arguments.block,
+        seed=arguments.seed,
+    )
+    motion.save(out, force=arguments.force)
+    say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
+
+
+def demo(arguments: argparse.Namespace) -> None:
+    """`minicmdm demo`: the shipped checkpoint acts out three sentences, and the oracle says what it sees."""
+    from minicmdm.demo import outputs, perform
+
+    files = outputs(Path(arguments.out), arguments.force)
+    _one_thread()
+    for prompt, seen, paths in perform(files, arguments.force):
+        print(f'"{prompt}"\n  the oracle sees: ' + "; ".join(_in_words(segment.to_dict()) for segment in seen))
+        print("  " + "\n  ".join(str(path.resolve()) for path in paths), flush=True)
+
+
+def _one_thread() -> None:
+    """The toy model is too small for two threads: on a busy machine they are ten times slower than one."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _in_words(segment: dict) -> str:
+    said = [str(segment[key]) for key in ("side", "direction", "speed", "overlay") if segment[key]]
+    said += [f"{segment['count']} times"] * bool(segment["count"])
+    return segment["action"] + (f" ({', '.join(said)})" if said else "")
+
+
+def inspect(arguments: argparse.Namespace) -> None:
+    """`minicmdm inspect`: segments in order, as the oracle reads them from the joints alone."""
+    from minicmdm.motion import load_joints
+
+    joints = load_joints(arguments.file)
+    from minicmdm.data.oracle import read_motion
+
+    segments = [segment.to_dict() for segment in read_motion(joints)]
+    if arguments.json:
+        print(json.dumps({"segments": segments}))
+        return
+    for segment in segments:
+        print(f"frames {segment['start']:4d}-{segment['end']:<4d} {_in_words(segment)}")
+
+
+def schedule(arguments: argparse.Namespace) -> None:
+    """`minicmdm schedule`: the matrix, one row per moment, and what it costs."""
+    from minicmdm.diffusion.schedules import cost, schedule_matrix
+
+    stagger = {"full": 0, "autoregressive": arguments.steps}.get(arguments.kind, arguments.uncertainty)
+    blocks = arguments.latents // max(arguments.block, 1)
+    cells = arguments.latents * (arguments.steps + stagger * blocks + 1)
+    if cells > MOST_CELLS:
+        raise ValueError(f"a matrix of {cells} numbers is too much to print: take one of at most {MOST_CELLS}")
+    matrix = schedule_matrix(arguments.latents, arguments.steps, arguments.uncertainty, arguments.block, arguments.kind)
+    price = cost(matrix)
+    if arguments.json:
+        answer = {"matrix": matrix.tolist(), "calls": price.calls, "latents_in_flight": price.latents_in_flight}
+        print(json.dumps(answer))
+        return
+    width = len(str(matrix.max()))
+    label = len(str(len(matrix) - 1))
+    for number, row in enumerate(matrix):
+        print(f"row {number:{label}d} | " + " ".join(f"{level:{width}d}" for level in row))
+    print(f"{price.calls} calls, at most {price.latents_in_flight} latents in flight")
+
+
+def data_make(arguments: argparse.Namespace) -> None:
+    """`minicmdm data make`: the toy world in HumanML3D's folder layout."""
+    out = Path(arguments.out)
+    if not arguments.out.strip() or (out.exists() and not out.is_dir()):
+        raise FileExistsError(f"--out must be a folder to make, and {arguments.out or 'nothing'} is a file or empty")
+    if not out.absolute().parent.is_dir():
+        raise FileNotFoundError(f"the folder {out.absolute().parent} for {out.name} does not exist: make it first")
+    filled = out.is_dir() and any(out.iterdir())
+    if filled and not arguments.force:
+        raise FileExistsError(f"the folder {out} is not empty and was left as it is: --force replaces a data set")
+    if filled and not (out / "programs.jsonl").is_file():  # --force deletes: only ever a data set of ours
+        raise FileExistsError(f"the folder {out} holds something else than toy data and was left as it is")
+    from minicmdm.data.dataset import make_folder
+
+    make_folder(out, force=out.is_dir())
+    say(f"wrote {out}")
+
+
+def train(arguments: argparse.Namespace) -> None:
+    """`minicmdm train`: all stages, or one of them."""
+    if arguments.threads < 1:
+        raise ValueError(f"--threads must be at least 1, and {arguments.threads} came")
+    if arguments.seed is not None and arguments.seed < 0:
+        raise ValueError(f"--seed must not be negative, and {arguments.seed} came")
+    if not arguments.out.strip():
+        raise ValueError("--out is empty: give a folder for the checkpoint")
+    import torch
+
+    from minicmdm.training.stages import train as run
+
+    torch.set_num_threads(arguments.threads)
+    said = {key: value for key, value in vars(arguments).items() if key not in ("run", "command", "out")}
+    flags = [
+        f"--{key}" if value is True else f"--{key} {shlex.quote(str(value))}" for key, value in said.items() if value
+    ]
+    out = run(
+        arguments.preset,
+        arguments.out,
+        arguments.stage,
+        resume=arguments.resume,
+        fast=arguments.fast,
+        data=arguments.data,
+        seed=arguments.seed,
+        command=" ".join(["minicmdm train", *flags]),
+        say=say,
+    )
+    say(f"wrote {out}")
+
+
+def evaluate(arguments: argparse.Namespace) -> None:
+    """`minicmdm evaluate`: the protocols as a table or JSON; with --quick, the flat numbers of a short one."""
+    from minicmdm.files import check_output, write_text
+
+    out = None if arguments.out is None else check_output(arguments.out, (".json", ".txt"), arguments.force)
+    asked = {"protocol": arguments.protocol, "evaluator": arguments.evaluator, "repeats": arguments.repeats}
+    asked = {key: value for key, value in asked.items() if value is not None}
+    sampling = {"schedule": arguments.schedule, "num_steps": arguments.steps}
+    sampling |= {"uncertainty": arguments.uncertainty, "guidance_scale": arguments.guidance}
+    sampling = {key: value for key, value in sampling.items() if value is not None}
+    if arguments.quick and (asked or arguments.table):
+        named = [f"--{key}" for key in asked] + ["--table"] * arguments.table
+        raise ValueError(f"--quick is a protocol of its own, with one flat list of numbers: leave out {named[0]}")
+    if arguments.limit is not None and arguments.limit < 1:
+        raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
+    _one_thread()
+    from minicmdm.evaluation import protocols
+    from minicmdm.evaluation.quick import evaluate_quick
+    from minicmdm.pipeline import MotionPipeline
+
+    if arguments.quick:
+        pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+        result = evaluate_quick(pipe, progress=True, limit=arguments.limit, **sampling)
+        rows = [f"{k:36s} {v:.4g}" if isinstance(v, float) else f"{k:36s} {v}" for k, v in result.items()]
+        text = "\n".join(rows)
+    else:
+        protocols.check(limit=arguments.limit, **asked)
+        pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+        asked |= {"checkpoint": arguments.checkpoint, "limit": arguments.limit}
+        result = protocols.evaluate(pipe, progress=True, **asked, **sampling)
+        text = protocols.table(result)
+    if out is not None:
+        write_text(out, (json.dumps(result, indent=2) if out.suffix == ".json" else text) + "\n")
+    encoding = getattr(sys.stdout, "encoding", None) or "ascii"  # a terminal without arrows gets question marks
+    print(json.dumps(result) if arguments.json else text.encode(encoding, "replace").decode(encoding))
+    if out is not None:
+        say(f"wrote {out}")
