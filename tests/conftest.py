@@ -39,7 +39,7 @@ def make_fake_data(count: int = 12, seed: int = 0) -> MotionDataset:
 def make_tiny_preset(**train) -> Preset:
     """A preset that trains in a second."""
     steps = dict(vae_steps=12, vae_batch=4, vae_lr=1e-3, vae_warmup=2, crop_frames=32)
-    steps |= dict(tmr_steps=12, tmr_batch=4, tmr_lr=1e-3, tmr_warmup=2)
+    steps |= dict(evaluator_steps=12, evaluator_batch=4, tmr_steps=12, tmr_batch=4, tmr_lr=1e-3, tmr_warmup=2)
     steps |= dict(dit_steps=12, dit_batch=4, dit_lr=1e-3, dit_warmup=2, ema=0.9)
     return Preset(
         "tiny",
