@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_committed, draw_times
+from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_times
 from minicmdm.diffusion.path import cosine_alpha_bar, data_to_velocity
+from minicmdm.models.dit import draw_boundary
 
 
 def seeded(seed=0):
@@ -115,19 +116,6 @@ def test_an_unknown_path_is_refused():
 # --- window attention -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("block_size", [1, 3])
-def test_the_boundary_is_uniform_over_blocks_and_leaves_one_to_denoise(block_size):
-    valid = torch.arange(9) < torch.tensor([9, 4]).repeat(1000)[:, None]
-    committed = draw_committed(2000, 9, block_size, valid, seeded())
-    assert committed.shape == (2000, 9) and not (committed[:, :-1] < committed[:, 1:]).any()  # a prefix
-    for length, rows in ((9, committed[::2]), (4, committed[1::2])):
-        counts = torch.bincount(rows.sum(1))
-        blocks = -(-length // block_size)
-        assert counts.nonzero().flatten().tolist() == [block_size * b for b in range(blocks)]
-        assert (counts[counts > 0] - 1000 / blocks).abs().max() < 100
-    assert (valid & ~committed).any(1).all()
-
-
 @pytest.mark.parametrize("path", ["flow", "ddpm"])
 def test_the_committed_are_given_clean_and_are_not_asked_for(path):
     z, seen = torch.randn(16, 6, 3, generator=seeded()), []
@@ -136,9 +124,9 @@ def test_the_committed_are_given_clean_and_are_not_asked_for(path):
         seen.append((x, t, committed))
         return torch.where(committed[..., None], torch.nan, 0 * x)
 
-    valid = torch.arange(6) < torch.arange(16)[:, None] % 6 + 1
-    loss = diffusion_forcing_loss(model, z, None, None, valid, generator=seeded(1), path=path, window=True)
-    x, t, committed = seen[0]
-    assert committed.any() and loss.isfinite() and loss > 0.5
+    committed, visible = draw_boundary(torch.ones(16, 6, dtype=torch.bool), 2, seeded())
+    loss = diffusion_forcing_loss(model, z, None, None, visible, 2, generator=seeded(1), path=path, committed=committed)
+    x, t, told = seen[0]
+    assert committed.any() and not visible.all() and told is committed and loss.isfinite() and loss > 0.5
     assert torch.equal(x[committed], z[committed]) and (t[committed] == 1).all()
     assert (t[~committed] < 1).float().mean() > 0.9

@@ -26,21 +26,6 @@ def draw_times(batch: int, num_latents: int, block_size: int, generator: torch.G
     return t.repeat_interleave(block_size, dim=1)[:, :num_latents]  # (B,N)
 
 
-def draw_committed(
-    batch: int, num_latents: int, block_size: int, valid: Tensor | None, generator: torch.Generator | None = None
-) -> Tensor:
-    """Which latents are finished (B,N) bool: whole blocks before a boundary that is uniform over the valid blocks.
-
-    Window attention is trained with it: latents before the boundary are clean and causal, and at least one block is
-    left to denoise.
-    """
-    device = generator.device if generator is not None else None
-    length = torch.full((batch,), num_latents, device=device) if valid is None else valid.sum(1).to(device)
-    blocks = (length + block_size - 1) // block_size
-    boundary = (torch.rand(batch, generator=generator, device=device) * blocks).floor() * block_size  # (B,)
-    return torch.arange(num_latents, device=device) < boundary[:, None]
-
-
 def diffusion_forcing_loss(
     model,
     z: Tensor,
@@ -51,7 +36,7 @@ def diffusion_forcing_loss(
     generator: torch.Generator | None = None,
     clock: Tensor | None = None,
     path: str = "flow",
-    window: bool = False,
+    committed: Tensor | None = None,
 ) -> Tensor:
     """The prediction's mean squared error over valid latents (CMDM Eq. 10, Alg. 1). Scalar.
 
@@ -59,16 +44,16 @@ def diffusion_forcing_loss(
     `model` as they are. Text drop is the caller's: it replaces a sample's sentence by "" before encoding, which
     keeps the words, the per-latent mask and the null branch of guidance one and the same thing.
     path: "flow" asks for the velocity at t, as the release does; "ddpm" for the noise at integer levels k of 0..1000,
-    as the paper writes, and tells the model 1 - k/1000. window: a random number of blocks at the start is clean
-    (`draw_committed`), the model hears of them as `committed` (B,N), and they are not asked for.
+    as the paper writes, and tells the model 1 - k/1000.
+    committed (B,N): latents that are finished, for window attention (models/dit.py `draw_boundary`). They are given
+    clean, the model hears of them, and they do not count.
     """
     batch, num_latents, _ = z.shape
     t = draw_times(batch, num_latents, block_size, generator).to(z)
     device = generator.device if generator is not None else z.device
     eps = torch.randn(z.shape, generator=generator, device=device).to(z)
     asked, more = valid, {}
-    if window:
-        committed = draw_committed(batch, num_latents, block_size, valid, generator).to(z.device)
+    if committed is not None:
         t = t.masked_fill(committed, 1.0)
         asked, more = ~committed if valid is None else valid & ~committed, {"committed": committed}
     if path == "flow":
