@@ -41,7 +41,9 @@ from minicmdm.diffusion.schedules import check_matrix
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # (z_t (B,N,C), t (B,N)) -> velocity (B,N,C)
 SOLVERS = ("euler", "heun", "ddpm", "ddim")
-NOISIEST = 0.99  # of K: the noisiest level at which a prediction of noise is turned into data
+NOISIEST = (
+    0.98  # of K, one of 50 steps from pure noise: the noisiest level at which a prediction of noise is turned into data
+)
 
 
 @dataclass
@@ -69,8 +71,9 @@ def sample_steps(
 ) -> Iterator[SampleStep]:
     """Yield the state at every row of the matrix (M,N), starting from noise (B,N,C).
 
-    Latents that wait for their turn are hidden: each call sees the latents up to the last one that moves, and
-    nothing after it. Under a causal mask that changes no number and saves half of the work.
+    Latents that wait for their turn are hidden: each call sees the latents up to the last one that has started, and
+    nothing after it. Under a causal mask that changes no number and saves half of the work. (The trapezoid starts at
+    both ends, so what waits between them is seen, as pure noise.)
     A prefix (B,P,C) of finished latents is put in front: it is at level 0 throughout, never moves, and is
     part of every z that is yielded. For a model with blocks, P should be a multiple of the block size.
     solver, path: see the top of the file. eta in [0,1] is read by "ddim" alone, and is 1 for "ddpm". Whoever draws new
@@ -96,10 +99,9 @@ def sample_steps(
     yield SampleStep(0, matrix[0], z, times[0], clean)
     for row in range(1, len(matrix)):
         before, after = times[row - 1], times[row]
-        moving = np.flatnonzero(matrix[row] != matrix[row - 1])
-        if len(moving):  # a row in which nothing moves costs nothing
-            # Columns start from left to right, so whatever lies right of the last mover is waiting (or finished).
-            seen = int(moving[-1]) + 1
+        if (matrix[row] != matrix[row - 1]).any():  # a row in which nothing moves costs nothing
+            # Right of the last latent that has started all wait. (One that is finished may stand right of all movers.)
+            seen = int(np.flatnonzero(matrix[row] < num_steps)[-1]) + 1
             v = _velocity(denoise, z, before, seen)
             clean = velocity_to_data(z, v, before)
             if solver == "heun":
@@ -157,8 +159,8 @@ def from_noise_prediction(predict: Denoise) -> Denoise:
     `predict` is bound to its text (`guided` will do: guiding eps and guiding v are the same) and was trained with
     `diffusion_forcing_loss(path="ddpm")`. It works with every solver; path="ddpm" visits the levels it knows.
     At pure noise a prediction of eps says nothing of the data: z = (x - sqrt(1 - abar) eps) / sqrt(abar) is 0/0 there,
-    and near it any error of eps is blown up. So the last hundredth of the levels is read as if it were NOISIEST K,
-    where 1.6 % of x is signal.
+    and near it any error of eps is blown up. So noisier levels are read as if they were NOISIEST K, where 3 % of x is
+    signal. Some of that error stays with "euler", "heun" and "ddim"; "ddpm" draws new noise and forgets it.
     """
 
     def denoise(z_t: Tensor, t: Tensor) -> Tensor:
