@@ -183,9 +183,9 @@ PRESETS = {
         dit=DiTConfig(latent_dim=16, text_dim=96, dim=128, layers=6, heads=4, text_layers=2, clock=True),
         train=TrainConfig(
             bfloat16=True,
-            evaluator_steps=1_500,
+            evaluator_steps=1_200,
             evaluator_batch=64,
-            evaluator_lr=2e-3,
+            evaluator_lr=1e-3,
             tmr_steps=1_000,
             tmr_batch=48,
             tmr_lr=2e-3,
