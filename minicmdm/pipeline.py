@@ -22,6 +22,10 @@ import minicmdm
 from minicmdm.data.features import features_to_joints
 from minicmdm.diffusion.sampling import guided, sample
 from minicmdm.diffusion.schedules import schedule_matrix
+from minicmdm.diffusion.streaming import LatentStream
+from minicmdm.live import MotionStream, latents_before
+from minicmdm.models.layers import States
+from minicmdm.models.text import Words
 from minicmdm.motion import Motion
 from minicmdm.training import checkpoints
 
@@ -114,6 +118,61 @@ class MotionPipeline:
                 motions[i] = Motion(joints, one, prompts[i])
         return motions[0] if single else [motions[i] for i in range(len(prompts))]
 
+    def stream(
+        self,
+        prompt: str | Sequence[str],
+        *,
+        schedule: str = "fss",
+        num_steps: int = 20,
+        uncertainty: int = 2,
+        guidance_scale: float = 3.0,
+        seed: int | Sequence[int] = 0,
+        block_size: int | None = None,
+        window: int | None = None,
+        new_prompt: str = "new",
+        num_frames: int | None = None,
+        lasts: int | None = None,
+    ) -> MotionStream:
+        """Begin a motion without an end: iterate for frames (22,3), and call `prompt` on it at any time.
+
+        It is what `pipe(prompt, tell_length=False)` gives, as long as its `window` of latents holds. A list of prompts
+        makes as many streams in step, frames (B,22,3). A `new_prompt` is heard by the "new" latents only, or by the
+        "active" ones in flight too. `num_frames` gives the stream an end after all; `lasts` tells how many frames the
+        prompt is for, where that is known. Raises ValueError for anything that cannot be asked.
+        """
+        single = isinstance(prompt, str)
+        prompts = [prompt] if single else _as_list(prompt, "prompt", "a string or a list of strings")
+        seeds = [_integer(s, "seed", 0, 2**63 - 1) for s in _spread(seed, len(prompts), "seed")]
+        num_frames = num_frames if num_frames is None else _integer(num_frames, "num_frames", 1, 2**31)
+        lasts = lasts if lasts is None else _integer(lasts, "lasts", 1, 2**31)
+
+        def read(sentences: list[str]) -> Words:
+            for sentence in sentences:
+                self._check_prompt(sentence)
+            return self.text.encode(sentences)
+
+        with torch.no_grad():
+            null = self.text.encode([""])
+        for text in prompts:
+            self._check_prompt(text)
+        latents = LatentStream(
+            self.dit,
+            read,
+            null,
+            prompts,
+            [torch.Generator().manual_seed(s) for s in seeds],
+            schedule=schedule,
+            num_steps=_integer(num_steps, "num_steps", 1, MAX_STEPS),
+            uncertainty=uncertainty,
+            block_size=self.preset.dit.block_size if block_size is None else _integer(block_size, "block_size", 1, 49),
+            guidance_scale=_check_guidance(guidance_scale),
+            window=window if window is None else _integer(window, "window", 1, 2**20),
+            new_prompt=new_prompt,
+            num_latents=None if num_frames is None else -(-num_frames // 4),
+            lasts=0 if lasts is None else max(1, latents_before(lasts)),
+        )
+        return MotionStream(latents, self.decode, single, num_frames)
+
     @torch.no_grad()
     def _generate(
         self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float, tell_length: bool
@@ -138,9 +197,9 @@ class MotionPipeline:
         return (self.vae.encode(x)[0] - self.stats["latent_mean"]) / self.stats["latent_std"]
 
     @torch.no_grad()
-    def decode(self, latents: Tensor) -> Tensor:
-        """Normalised latents (B,N,C) -> features (B,4N,D)."""
-        x = self.vae.decode(latents * self.stats["latent_std"] + self.stats["latent_mean"])
+    def decode(self, latents: Tensor, states: States | None = None) -> Tensor:
+        """Normalised latents (B,N,C) -> features (B,4N,D); with `states` they continue those of the call before."""
+        x = self.vae.decode(latents * self.stats["latent_std"] + self.stats["latent_mean"], states)
         return x * self.stats["feature_std"] + self.stats["feature_mean"]
 
     def reconstruct(self, features: np.ndarray) -> np.ndarray:
