@@ -261,7 +261,7 @@ def test_runs_are_not_mixed(tiny_run, tiny_preset, tiny_world):
     tiny_world(tiny_preset)
     with pytest.raises(FileExistsError, match="--resume"):
         stages.train("tiny", tiny_run, progress=False)
-    with pytest.raises(ValueError, match="another run .its preset"):
+    with pytest.raises(ValueError, match="another run .its seed"):
         stages.train("tiny", tiny_run, resume=True, seed=5, progress=False)
     with pytest.raises(ValueError, match="unknown stage"):
         stages.train("tiny", tiny_run, stage="gan", progress=False)
