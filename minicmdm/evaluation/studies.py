@@ -2,6 +2,7 @@
 
     python -m minicmdm.evaluation.studies vae         three VAEs, three seeds: does the order of CMDM's Table 4 hold?
     python -m minicmdm.evaluation.studies agreement   do R@3 and FID track what the oracle sees?
+    python -m minicmdm.evaluation.studies hearing     which mistakes in a caption the judges notice
     python -m minicmdm.evaluation.studies dimensions  noise where a skeleton shows it, and elsewhere (MARDM Table 3)
 
 Each row is written as soon as it is measured, and rows that are there already are not measured again: a study that was
@@ -21,10 +22,12 @@ import numpy as np
 from scipy import stats
 
 from minicmdm.config import Preset, preset
+from minicmdm.data import grammar
 from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints, joints_to_features, mirror_joints
+from minicmdm.data.programs import FIELDS, Program
 from minicmdm.evaluation import metrics
-from minicmdm.evaluation.evaluators import embed, load_bench
+from minicmdm.evaluation.evaluators import embed, load_bench, near_miss
 from minicmdm.evaluation.protocols import reconstruction, text_to_motion
 from minicmdm.motion import Motion
 from minicmdm.pipeline import ASSETS, MotionPipeline
@@ -168,9 +171,36 @@ def dimension_rows(scratch: Path) -> Iterator[tuple[Row, Callable[[], Row]]]:
             yield {"noise in": where, "sigma": sigma}, measure
 
 
+def hearing_rows(scratch: Path) -> Iterator[tuple[Row, Callable[[], Row]]]:
+    """What the judges hear: how often a motion is nearer to its caption than to one with a single thing wrong."""
+    clips, bench = toy_dataset("test").clips, load_bench()
+    rng, missed = np.random.default_rng(0), {}
+    for clip in clips:
+        if (miss := near_miss(clip.program, rng)) is not None:
+            missed.setdefault(_difference(clip.program, miss), []).append((clip, grammar.caption(rng, miss)))
+    for what, pairs in sorted(missed.items()):
+
+        def measure(pairs=pairs) -> Row:
+            row, motions = {"pairs": len(pairs)}, [clip.features for clip, _ in pairs]
+            for name, judge in bench.items():
+                right, motion = embed(judge, [clip.captions[0] for clip, _ in pairs], motions)
+                wrong = embed(judge, [text for _, text in pairs], motions)[0]
+                near = [np.linalg.norm(text - motion, axis=1) for text in (right, wrong)]
+                row[name] = float((near[0] < near[1]).mean())
+            return row
+
+        yield {"wrong": what}, measure
+
+
+def _difference(program: Program, other: Program) -> str:
+    if [s.action for s in program] != [s.action for s in other]:
+        return "order"
+    return next(key for key in FIELDS for a, b in zip(program, other) if getattr(a, key) != getattr(b, key))
+
+
 # --- CSVs and what they say -----------------------------------------------------------------------------------------
 
-ROWS = {"vae": vae_rows, "agreement": agreement_rows, "dimensions": dimension_rows}
+ROWS = {"vae": vae_rows, "agreement": agreement_rows, "dimensions": dimension_rows, "hearing": hearing_rows}
 
 
 def run(name: str, folder: Path, scratch: Path) -> list[Row]:
