@@ -20,10 +20,9 @@ from minicmdm.diffusion.gaussian import (
     wasserstein2,
 )
 from minicmdm.diffusion.sampling import sample
-from minicmdm.diffusion.schedules import literal_matrix, schedule_matrix
+from minicmdm.diffusion.schedules import KINDS, literal_matrix, schedule_matrix
 from minicmdm.models.dit import self_attention_mask
 
-LEFT_TO_RIGHT = ("full", "autoregressive", "fss", "triangular")
 N, K = 24, 50
 SCHEDULES = {  # from no overlap to full overlap: the number of latents in flight
     "1": dict(kind="autoregressive"),
@@ -76,7 +75,7 @@ def calls(matrix):
         yield before, after == matrix[0, 0], after < before
 
 
-@given(st.sampled_from((*LEFT_TO_RIGHT, "trapezoid")), st.integers(1, 9), st.integers(1, 4), st.integers(1, 4))
+@given(st.sampled_from(KINDS), st.integers(1, 9), st.integers(1, 4), st.integers(1, 4))
 @settings(deadline=None, max_examples=60)
 def test_the_labs_masks_are_the_models(kind, num_latents, num_steps, block_size):
     for levels, waiting, _ in calls(schedule_matrix(num_latents, num_steps, 1, block_size, kind)):
@@ -109,7 +108,7 @@ def test_latents_that_wait_would_tell_nothing():
             np.testing.assert_allclose(*found, atol=1e-10)
 
 
-@pytest.mark.parametrize("kind", LEFT_TO_RIGHT)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("mask", ["causal", "bidirectional"])
 def test_the_covariance_is_that_of_the_projects_sampler(mask, kind):
     covariance, matrix = random_covariance(np.random.default_rng(1), 5), schedule_matrix(5, 7, 3, kind=kind)
