@@ -149,7 +149,21 @@ def test_keys_and_values_computed_earlier_give_the_same_answer(attention):
 def test_no_mask_shows_everything(attention):
     layer, x, context = attention
     mask = torch.ones(2, 5, 4, dtype=torch.bool)
-    assert torch.equal(layer.attend(x, *layer.keys_values(context), None), layer(x, context, mask))
+    assert torch.allclose(layer.attend(x, *layer.keys_values(context), None), layer(x, context, mask), rtol=1e-12)
+
+
+def test_sampling_and_training_attend_alike_with_masks_of_truth_and_of_numbers(attention):
+    layer, x, context = attention
+    mask = torch.rand(2, 5, 4, generator=torch.Generator().manual_seed(0)) > 0.5
+    added = torch.zeros(2, 5, 4).double().masked_fill(~mask, -torch.inf)
+    blind = ~mask.any(-1)
+    assert blind.any()  # a query that sees nothing: only a mask of truth may hold one
+    trained = layer(x, context, mask)
+    with torch.no_grad():  # the library's fused attention
+        assert torch.allclose(layer(x, context, mask), trained, rtol=1e-9, atol=1e-12)
+        fused = layer(x, context, added)
+    for found in (layer(x, context, added), fused):
+        assert torch.allclose(found[~blind], trained[~blind], rtol=1e-9, atol=1e-12)
 
 
 def attend_one_by_one(layer, x, window, ahead=2):

@@ -110,6 +110,7 @@ def cases(draw):
     attention = draw(st.sampled_from(["causal", "bidirectional", "window"]))
     cfg = replace(TINY, attention=attention, block_size=draw(st.integers(1, 3)), clock=draw(st.booleans()))
     cfg = replace(cfg, layers=draw(st.integers(1, 3)), heads=draw(st.sampled_from([1, 2, 4])))
+    cfg = replace(cfg, text_layers=draw(st.integers(0, 1)))
     num_steps = draw(st.integers(1, 6))
     how = dict(schedule=draw(st.sampled_from(["full", "fss", "autoregressive", "triangular"])), num_steps=num_steps)
     how |= dict(uncertainty=draw(st.integers(0, num_steps)), block_size=draw(st.integers(1, 4)))

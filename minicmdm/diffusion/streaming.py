@@ -214,7 +214,7 @@ class LatentStream:
         mask = self_attention_mask(
             n, self.cfg.block_size, self.cfg.attention, device=which.device, committed=(which == 0)[None]
         )
-        mask = None if mask.all() else F.pad(mask, (kept, 0), value=True)  # everybody sees what is kept
+        mask = F.pad(mask, (kept, 0), value=True)  # everybody sees what is kept
 
         used = list(dict.fromkeys(self.heard))  # what is told to anybody in z: seldom more than one or two
         owner = torch.tensor([used.index(said) for said in self.heard], device=which.device)  # (n,)
@@ -239,8 +239,8 @@ class LatentStream:
             which.expand(copies * len(self.z), -1),
             self.modulations,
             words,
-            None if word_mask.all() else word_mask,
-            mask,
+            self._added(word_mask),
+            self._added(mask),
             torch.arange(slot, slot + n, device=which.device),
             told,
             self.cache,
@@ -249,6 +249,10 @@ class LatentStream:
             return v
         v_text, v_null = v.chunk(2)
         return v_null + self.guidance_scale * (v_text - v_null)
+
+    def _added(self, mask: Tensor) -> Tensor | None:
+        """A mask as numbers to add to the scores, once a call rather than once a layer; None if it hides nothing."""
+        return None if mask.all() else torch.zeros_like(mask, dtype=self.model_dtype).masked_fill(~mask, -torch.inf)
 
     def _read(self, sentences: list[str]) -> tuple[list[tuple[Tensor, Tensor]], Tensor]:
         """Every block's keys and values (R,H,S,d) of the sentences, then of "", and which words are real (R,S)."""

@@ -22,7 +22,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from minicmdm.config import DiTConfig
-from minicmdm.models.layers import Attention, KeyValueCache, modulate, sinusoid
+from minicmdm.models.layers import Attention, KeyValueCache, Turns, modulate, sinusoid, turns
 
 ATTENTION = ("causal", "bidirectional", "window")
 CLOCK_DIM = 64  # waves for each of the clock's two numbers
@@ -119,7 +119,7 @@ class Block(nn.Module):
         words: tuple[Tensor, Tensor],
         word_mask: Tensor | None,
         mask: Tensor | None,
-        positions: Tensor,
+        positions: Turns,
         write=None,
     ) -> Tensor:
         """x (B,N,dim), modulation (B,N,6*dim), words as keys and values; `write` adds what a cache has kept."""
@@ -247,15 +247,17 @@ class CausalDiT(nn.Module):
         """The velocity (B,N,C) of latents z_t (B,N,C) at positions (N,), the rest of the work being done.
 
         which (B,N) numbers the rows of `modulations`; `words` comes from `read_words`, with word_mask (B,N,S); mask
-        (N,N') or (B,N,N') covers the N' - N latents of the cache first; told (B,N,.) are `clock_features`.
+        (N,N') or (B,N,N') covers the N' - N latents of the cache first; told (B,N,.) are `clock_features`. Masks as in
+        `Attention.attend`.
         """
         x = self.embed_latent(z_t)  # (B,N,C) -> (B,N,dim)
         if told is not None:
             x = x + self.embed_clock(told)
-        for layer, block in enumerate(self.blocks):
-            modulation = F.embedding(which, modulations[layer])  # (U,6*dim) -> (B,N,6*dim)
+        positions = turns(positions, self.cfg.dim // self.cfg.heads, x.dtype)
+        for layer, (block, table, keys_values) in enumerate(zip(self.blocks, modulations, words)):
+            modulation = F.embedding(which, table)  # (U,6*dim) -> (B,N,6*dim)
             write = None if cache is None else partial(cache.write, layer)
-            x = block(x, modulation, words[layer], word_mask, mask, positions, write)
+            x = block(x, modulation, keys_values, word_mask, mask, positions, write)
         return self.out(x)  # (B,N,dim) -> (B,N,C)
 
     def _check(self, z_t, t, words, word_mask, valid, clock, committed):

@@ -86,21 +86,31 @@ def sinusoid(t: Tensor, dim: int) -> Tensor:
     return torch.cat([angle.cos(), angle.sin()], dim=-1)
 
 
-def rotate(x: Tensor, positions: Tensor) -> Tensor:
+Turns = tuple[Tensor, Tensor]  # what `turns` makes of positions: (N,1,d) each
+
+
+def turns(positions: Tensor, width: int, dtype: torch.dtype) -> Turns:
+    """Cosines and signed sines of the angles by which `rotate` turns the pairs of vectors of an even width d.
+
+    The same for every layer, so a model may compute them once. Nothing is tabled: there is no longest sequence.
+    """
+    wide = torch.promote_types(dtype, torch.float32)  # an angle in bfloat16 would be off by whole latents
+    exponent = torch.arange(width // 2, device=positions.device, dtype=wide) / (width // 2)
+    angle = positions.to(wide)[:, None, None] * 10_000.0**-exponent  # (N,1,d/2)
+    cos, sin = angle.cos().to(dtype), angle.sin().to(dtype)
+    return torch.cat([cos, cos], dim=-1), torch.cat([-sin, sin], dim=-1)
+
+
+def rotate(x: Tensor, positions: Tensor | Turns) -> Tensor:
     """Rotary position embedding (RoPE): turn each channel pair by an angle proportional to the position.
 
-    Channel i of the first half and channel i of the second are the two coordinates of a pair. A dot product of two
-    rotated vectors then depends on the difference of their positions only. Nothing is tabled, so there is no longest
-    sequence. x (B,N,H,d) with d even, positions (N,).
+    Channel i of the first half (a) and channel i of the second (b) are the two coordinates of a pair, which becomes
+    (a cos - b sin, b cos + a sin). A dot product of two rotated vectors then depends on the difference of their
+    positions only. x (B,N,H,d) with d even; positions (N,), or their `turns`.
     """
-    half = x.shape[-1] // 2
-    wide = torch.promote_types(x.dtype, torch.float32)  # an angle in bfloat16 would be off by whole latents
-    exponent = torch.arange(half, device=x.device, dtype=wide) / half
-    angle = positions.to(wide)[:, None, None] * 10_000.0**-exponent  # (N,1,d/2)
-    cos, sin = angle.cos().to(x.dtype), angle.sin().to(x.dtype)
-    a, b = x.chunk(2, dim=-1)  # 2 x (B,N,H,d/2)
+    cos, sin = turns(positions, x.shape[-1], x.dtype) if isinstance(positions, Tensor) else positions
     # Real numbers: the complex product that says the same in one line is thirty times slower on a CPU.
-    return torch.cat([a * cos - b * sin, a * sin + b * cos], dim=-1)
+    return torch.addcmul(x * cos, x.roll(x.shape[-1] // 2, dims=-1), sin)
 
 
 class Attention(nn.Module):
@@ -119,34 +129,36 @@ class Attention(nn.Module):
         self.query, self.key, self.value, self.out = (nn.Linear(dim, dim) for _ in range(4))
         self.query_norm, self.key_norm = RMSNorm(dim), RMSNorm(dim)
 
-    def split(self, x: Tensor, positions: Tensor | None) -> Tensor:
+    def split(self, x: Tensor, positions: Tensor | Turns | None) -> Tensor:
         x = x.unflatten(-1, (self.heads, -1))  # (B,N,dim) -> (B,N,H,d)
         return (x if positions is None else rotate(x, positions)).transpose(1, 2)  # (B,H,N,d)
 
-    def keys_values(self, context: Tensor, positions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def keys_values(self, context: Tensor, positions: Tensor | Turns | None = None) -> tuple[Tensor, Tensor]:
         """Keys and values (B,H,S,d) of a context (B,S,dim) whose entries stand at `positions` (S,)."""
         return self.split(self.key_norm(self.key(context)), positions), self.split(self.value(context), None)
 
     def attend(self, x: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None, positions=None) -> Tensor:
         """x (B,N,dim) looks at keys and values (B,H,S,d) where mask (N,S) or (B,N,S) is True -> (B,N,dim).
 
-        No mask shows everything.
+        No mask shows everything. A mask of numbers is added to the scores, and must leave something to every query.
         """
         queries = self.split(self.query_norm(self.query(x)), positions)
         queries = queries * queries.shape[-1] ** -0.5  # here rather than on the scores, which are more numbers
         if mask is not None and mask.ndim == 3:
             mask = mask.unsqueeze(1)  # (B,N,S) -> (B,1,N,S): the same for all heads
-        # Written out rather than `scaled_dot_product_attention`: with 49 latents there is no memory to save, and on
-        # a CPU in bfloat16 the fused backward pass is ten times slower than this. Autocast is off because it would
-        # widen every score to float32; a softmax sums in float32 by itself.
+        # Autocast is off because it would widen every score to float32; a softmax sums in float32 by itself.
         with torch.autocast(x.device.type, enabled=False):
             keys, values = keys.to(queries.dtype), values.to(queries.dtype)
-            scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
-            if mask is not None:
-                scores = scores.masked_fill(~mask, torch.finfo(scores.dtype).min)
-            out = scores.softmax(-1) @ values  # (B,H,N,d)
+            if not torch.is_grad_enabled():
+                out = F.scaled_dot_product_attention(queries, keys, values, mask, scale=1.0)  # (B,H,N,d)
+            else:  # written out: on a CPU in bfloat16 the fused backward pass is ten times slower than this
+                scores = queries @ keys.transpose(-1, -2)  # (B,H,N,S)
+                if mask is not None:
+                    hidden = torch.finfo(scores.dtype).min
+                    scores = scores + mask if mask.is_floating_point() else scores.masked_fill(~mask, hidden)
+                out = scores.softmax(-1) @ values  # (B,H,N,d)
         # A query that may look at nothing has a softmax over equal scores; its answer is zero, not their mean.
-        if mask is not None and (nothing := ~mask.any(-1, keepdim=True)).any():
+        if mask is not None and mask.dtype == torch.bool and (nothing := ~mask.any(-1, keepdim=True)).any():
             out = out.masked_fill(nothing, 0.0)
         return self.out(out.transpose(1, 2).flatten(2))  # (B,N,dim)
 
