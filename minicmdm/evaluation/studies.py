@@ -92,8 +92,8 @@ class Spoilt:
         prompts = list(prompts)
         if self.how == "hears another":
             some = np.flatnonzero(rng.random(len(prompts)) < self.amount)
-            for i, j in zip(some, np.roll(some, 1)):
-                prompts[i] = prompts[j]
+            for i, other in zip(some, [prompts[j] for j in np.roll(some, 1)]):
+                prompts[i] = other
         keys = [(id(self.pipe), *one, *ask.values()) for one in zip(prompts, frames, seed)]
         new = [k for k, key in enumerate(keys) if key not in self.known]
         if new:

@@ -1,0 +1,104 @@
+"""Studies: rows are measured once, intervals are Student's, and what spoils a motion spoils it in the way it says."""
+
+import numpy as np
+import pytest
+import torch
+
+from minicmdm.data.dataset import toy_dataset
+from minicmdm.data.features import features_to_joints
+from minicmdm.data.oracle import read_motion
+from minicmdm.evaluation import studies
+from minicmdm.motion import Motion
+
+
+class Truth:
+    """A pipeline that knows the answers: each prompt's own synthesised motion."""
+
+    def __init__(self, clips, std):
+        self.answers = {clip.captions[0]: clip.features for clip in clips}
+        self.stats, self.asked = {"feature_std": torch.from_numpy(std)}, 0
+
+    def __call__(self, prompts, frames, *, seed, **ask):
+        self.asked += len(prompts)
+        found = [self.answers[prompt] for prompt in prompts]
+        return [Motion(features_to_joints(x), x, prompt) for x, prompt in zip(found, prompts)]
+
+
+@pytest.fixture
+def world():
+    data = toy_dataset("test", 12)
+    clips = {clip.captions[0]: clip for clip in data.clips}
+    return list(clips.values()), Truth(clips.values(), data.std)
+
+
+def ask(pipe, clips):
+    return pipe([c.captions[0] for c in clips], [len(c.features) for c in clips], seed=list(range(len(clips))))
+
+
+def test_what_is_whole_is_the_pipeline_and_is_asked_once(world):
+    clips, pipe = world
+    for _ in range(2):
+        found = ask(studies.Spoilt(pipe, "is whole"), clips)
+        assert all(np.array_equal(motion.features, clip.features) for motion, clip in zip(found, clips))
+    assert pipe.asked == len(clips)
+
+
+def test_each_way_of_spoiling_does_what_it_says(world):
+    clips, pipe = world
+    spoilt = {
+        how: ask(studies.Spoilt(pipe, how, 0.5), clips) for how in ("freezes", "trembles", "is mirrored", "is slow")
+    }
+    assert all(np.ptp(m.features, axis=0).max() < 1e-6 for m in spoilt["freezes"])
+    for clip, shaken in zip(clips, spoilt["trembles"]):
+        apart = (shaken.features - clip.features) / pipe.stats["feature_std"].numpy()
+        np.testing.assert_allclose(apart.std(), 0.5, rtol=0.05)
+    swap = {"left": "right", "right": "left", None: None}
+    sides = [
+        (swap[one.side], other.side)
+        for clip, m in zip(clips, spoilt["is mirrored"])
+        for one, other in zip(read_motion(features_to_joints(clip.features)), read_motion(m.joints))
+        if one.action == other.action
+    ]
+    assert len(sides) > 10 and np.mean([a == b for a, b in sides]) > 0.9
+    for clip, slow in zip(clips, spoilt["is slow"]):  # half of the motion, held twice as long
+        assert len(slow.features) == len(clip.features)
+        np.testing.assert_allclose(
+            slow.joints[-1, :, 1], features_to_joints(clip.features)[len(clip.features) // 2, :, 1], atol=0.15
+        )
+
+
+def test_hearing_another_answers_another_prompt(world):
+    clips, pipe = world
+    found = ask(studies.Spoilt(pipe, "hears another", 1.0), clips)
+    assert not any(np.array_equal(motion.features, clip.features) for motion, clip in zip(found, clips))
+    assert sorted(len(m.features) for m in found) == sorted(len(c.features) for c in clips)
+
+
+def test_a_row_is_measured_once(tmp_path, monkeypatch):
+    calls = []
+
+    def rows(scratch):
+        for k in range(3):
+            yield {"model": f"m{k}", "seed": k}, lambda k=k: calls.append(k) or {"score": k / 3}
+
+    monkeypatch.setitem(studies.ROWS, "vae", rows)
+    first = studies.run("vae", tmp_path, tmp_path)
+    assert calls == [0, 1, 2] and [row["score"] for row in first] == [0.0, 0.33333, 0.66667]
+    lines = (tmp_path / "vae.csv").read_text().splitlines()
+    (tmp_path / "vae.csv").write_text("\n".join(lines[:-1]) + "\n")  # as if stopped before the last
+    again = studies.run("vae", tmp_path, tmp_path)
+    assert calls == [0, 1, 2, 2] and len(again) == 3
+
+
+def test_intervals_and_correlations_against_hand_computed_ones():
+    assert studies.interval([1.0, 2.0, 3.0]) == "2 ± 2.5"  # t(0.975, 2) = 4.303 times 1 / sqrt(3)
+    assert studies.correlation(np.arange(12.0), np.arange(12.0) ** 3).startswith("+1.00 [+1.00, +1.00], 12")
+    assert studies.correlation(np.arange(12.0), -np.exp(np.arange(12.0))).startswith("-1.00")
+
+
+@pytest.mark.parametrize("name", studies.ROWS)
+def test_committed_rows_can_be_told(name):
+    rows = studies.read(name)
+    if not rows:
+        pytest.skip(f"the study {name} has no committed CSV yet")
+    assert len(studies.summary(name, rows).splitlines()) >= 2
