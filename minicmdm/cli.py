@@ -1,4 +1,4 @@
-"""The command line: `minicmdm demo | generate | inspect | schedule | data | train | evaluate`.
+"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | train | evaluate`.
 
 Three habits hold for every command. What others parse (JSON, a matrix) goes to stdout; what people read while they wait
 goes to stderr. Whatever is wrong with a request is said in one line that begins "minicmdm: ", the exit code is 2, and
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from minicmdm.commands import data_make, demo, evaluate, generate, inspect, say, schedule, train
+from minicmdm.commands import data_make, demo, evaluate, generate, inspect, say, schedule, stream, train
 
 WRONG, INTERRUPTED, READER_GONE = 2, 130, 141  # exit codes; the last two are what a shell reports for the signals
 
@@ -69,20 +69,31 @@ def _parser() -> Parser:
     sub.add_argument("--out", default="demo", help="folder for the files, made if missing (default demo)")
     sub.add_argument("--force", action="store_true", help="replace files that exist")
 
+    def sampling(sub: Parser, schedules: str) -> None:
+        sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
+        sub.add_argument("--steps", type=int, default=20, help="K, denoising steps of each latent (default 20)")
+        sub.add_argument(
+            "--uncertainty", type=int, default=2, help="L, how many steps later the next latent starts (default 2)"
+        )
+        sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
+        sub.add_argument("--schedule", default="fss", help=f"{schedules} (default fss)")
+        sub.add_argument("--block", type=int, help="latents that are denoised together (default: the model's own)")
+        sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
+        sub.add_argument("--force", action="store_true", help="replace an output that exists")
+
     sub = command("generate", generate, "Turn a sentence into a motion: an .html player, a .gif, or an .npy of joints.")
     sub.add_argument("prompt", metavar="PROMPT", help='what to do, for example "a person walks, then waves"')
     sub.add_argument("--out", default="motion.html", help="file to write: .html, .gif or .npy (default motion.html)")
     sub.add_argument("--frames", type=int, default=120, help="length at 20 frames per second, 4 to 196 (default 120)")
-    sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
-    sub.add_argument("--steps", type=int, default=20, help="K, denoising steps of each latent (default 20)")
+    sampling(sub, "fss, full or autoregressive")
+
+    sub = command("stream", stream, "Turn lines of SECONDS<TAB>PROMPT into frames as they come: one JSON line each.")
     sub.add_argument(
-        "--uncertainty", type=int, default=2, help="L, how many steps later the next latent starts (default 2)"
+        "file", metavar="FILE", nargs="?", default="-", help="the timeline (default -: stdin, line by line)"
     )
-    sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
-    sub.add_argument("--schedule", default="fss", help="fss, full or autoregressive (default fss)")
-    sub.add_argument("--block", type=int, help="latents that are denoised together (default: the model's own)")
-    sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
-    sub.add_argument("--force", action="store_true", help="replace an output that exists")
+    sub.add_argument("--out", help="write a .jsonl or .npy file rather than to stdout")
+    sub.add_argument("--window", type=int, help="the most latents that one call sees (default 49, or those in flight)")
+    sampling(sub, "fss, autoregressive or triangular")
 
     sub = command("inspect", inspect, "Read a motion back: what does the oracle see in an .npy of joints (T,22,3)?")
     sub.add_argument("file", metavar="FILE", help="an .npy of joints in metres")

@@ -7,6 +7,7 @@ import json
 import os
 import shlex
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 MOST_CELLS = 1_000_000  # of a printed matrix
@@ -51,6 +52,69 @@ def generate(arguments: argparse.Namespace) -> None:
     )
     motion.save(out, force=arguments.force)
     say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
+
+
+def stream(arguments: argparse.Namespace) -> None:
+    """`minicmdm stream`: a timeline of prompts in, frames out as they come, until the timeline ends."""
+    from minicmdm.files import check_output, whole_file
+
+    out = None if arguments.out is None else check_output(arguments.out, (".jsonl", ".npy"), arguments.force)
+    lines = _timeline(arguments.file)
+    first = next(lines, None)
+    if first is None:
+        raise ValueError("no prompt came: give lines of seconds, a tab and a prompt, like '4<TAB>a person walks'")
+    _one_thread()
+    import numpy as np
+
+    from minicmdm.live import follow, frame_line
+    from minicmdm.pipeline import MotionPipeline
+
+    pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+    flow = pipe.stream(
+        first[1],
+        lasts=first[0],
+        schedule=arguments.schedule,
+        num_steps=arguments.steps,
+        uncertainty=arguments.uncertainty,
+        guidance_scale=arguments.guidance,
+        block_size=arguments.block,
+        window=arguments.window,
+        seed=arguments.seed,
+    )
+
+    if out is None:
+        for number, (prompt, joints) in enumerate(follow(flow, first, lines)):
+            print(frame_line(number, prompt, joints), flush=True)
+        return
+    count = 0
+    with whole_file(out) as temporary, open(temporary, "wb") as file:
+
+        def header() -> None:
+            shape = {"descr": "<f4", "fortran_order": False, "shape": (count, 22, 3)}
+            np.lib.format.write_array_header_1_0(file, shape)  # numpy leaves room for a count that grows
+
+        if out.suffix.lower() == ".npy":
+            header()
+        for prompt, joints in follow(flow, first, lines):
+            text = out.suffix.lower() == ".jsonl"
+            file.write(frame_line(count, prompt, joints).encode() + b"\n" if text else joints.astype("<f4").tobytes())
+            count += 1
+        if out.suffix.lower() == ".npy":
+            file.seek(0)
+            header()
+    say(f"wrote {out} ({count} frames, {count / 20:.1f} s)")
+
+
+def _timeline(name: str) -> Iterator[tuple[int, str]]:
+    """The (frames, prompt) of each line of a file, or of "-", stdin, whose lines are read one by one as they come."""
+    from minicmdm.live import timeline
+
+    if name == "-":
+        return timeline(getattr(sys.stdin, "buffer", sys.stdin))
+    if not Path(name).is_file():
+        raise FileNotFoundError(f"no file {name}: lines of seconds, a tab and a prompt were expected there")
+    with open(name, "rb") as file:
+        return iter(list(timeline(file)))  # a bad line is refused before any work
 
 
 def demo(arguments: argparse.Namespace) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 from torch import Tensor
@@ -10,6 +11,8 @@ from torch import Tensor
 from minicmdm.data.features import essential, features_to_joints, turn
 from minicmdm.diffusion.streaming import LatentStream
 from minicmdm.models.layers import States
+
+FPS, LONGEST = 20, 86_400  # frames per second; a line of a timeline may last a day
 
 
 class MotionStream:
@@ -81,3 +84,50 @@ class MotionStream:
 def latents_before(frame: int) -> int:
     """How many latents belong to what comes before a frame: those whose middle does (`latent_owners` in training)."""
     return (frame + 1) // 4
+
+
+def timeline(lines: Iterable[bytes | str]) -> Iterator[tuple[int, str]]:
+    """The (frames, prompt) of every line "seconds<TAB>prompt", as they come. ValueError: a line that says neither."""
+    for number, line in enumerate(lines, start=1):
+        try:
+            line = line if isinstance(line, str) else line.decode("utf-8")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"line {number} is not UTF-8 text: {error}") from error
+        if not line.strip():
+            continue
+        seconds, tab, prompt = line.strip().partition("\t")
+        try:
+            frames = round(float(seconds) * FPS)
+        except (ValueError, OverflowError):  # no number, or an infinite one
+            frames = 0
+        if not tab or not prompt.strip() or not 1 <= frames <= LONGEST * FPS:
+            expected = f"seconds (0.05 to {LONGEST}), a tab and a prompt"
+            raise ValueError(f"line {number}: expected {expected}, and {line.strip()[:80]!r} came")
+        yield frames, prompt.strip()
+
+
+def follow(
+    stream: MotionStream, first: tuple[int, str], rest: Iterator[tuple[int, str]]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Every frame of a timeline with its prompt; `stream` was begun with the first. Ends with the timeline.
+
+    The rest is asked for one by one, when latents that will hear the next prompt are about to start and no sooner: the
+    prompts may be thought of while the frames come, and each begins on its own frame nevertheless.
+    """
+    number, ends = 0, [first]  # of prompts whose frames are to come: the frame where they end, and what they say
+    while True:
+        while (told := ends[-1][0]) < number + stream.horizon and (next_one := next(rest, None)):
+            frames, prompt = next_one
+            stream.prompt(prompt, at=told, lasts=frames)
+            ends.append((told + frames, prompt))
+        if ends[0][0] == number:
+            ends.pop(0)
+        if not ends:
+            return
+        yield ends[0][1], next(stream)
+        number += 1
+
+
+def frame_line(number: int, prompt: str, joints: np.ndarray) -> str:
+    """One frame (22,3) as a line of JSON, joints in metres to a tenth of a millimetre."""
+    return json.dumps({"frame": number, "prompt": prompt, "joints": [[round(float(x), 4) for x in j] for j in joints]})

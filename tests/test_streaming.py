@@ -1,5 +1,7 @@
 """The stream is the dense sampler for every schedule, block size and mask, with prompts that change; then it slides."""
 
+import io
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from model_helpers import randomise
 
+from minicmdm import cli
 from minicmdm.config import DiTConfig
 from minicmdm.data.features import features_to_joints
 from minicmdm.diffusion.sampling import guided, sample
@@ -395,3 +398,85 @@ def test_a_bad_prompt_leaves_the_stream_as_it_was(pipe):
         with pytest.raises((ValueError, TypeError)):
             stream.prompt(bad)
     assert np.array_equal(next(stream), next(other)) and stream.latents.said[0].sentences == ["a person walks"]
+
+
+# ---- the command
+
+
+@pytest.fixture
+def here(pipe, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(MotionPipeline, "from_pretrained", lambda name: pipe)
+    return tmp_path
+
+
+def listen_to(text, monkeypatch):
+    monkeypatch.setattr("sys.stdin", io.TextIOWrapper(io.BytesIO(text.encode())))
+
+
+TIMELINE = "1.5\ta person walks\n\n0.25\ta person jumps twice\n2\ta person sits down\n"
+FLAGS = ["--steps", "4", "--seed", "3"]
+
+
+def test_a_timeline_becomes_frames_each_with_its_prompt(here, monkeypatch, capsys, pipe):
+    listen_to(TIMELINE, monkeypatch)
+    assert cli.main(["stream", *FLAGS]) == 0
+    said = capsys.readouterr()
+    frames = [json.loads(line) for line in said.out.splitlines()]
+    assert [frame["frame"] for frame in frames] == list(range(75)) and said.err == ""
+    prompts = ["a person walks"] * 30 + ["a person jumps twice"] * 5 + ["a person sits down"] * 40
+    assert [frame["prompt"] for frame in frames] == prompts
+    # every prompt is heard from its own time on, whenever it was read
+    stream = pipe.stream("a person walks", num_steps=4, seed=3, lasts=30)
+    stream.prompt("a person jumps twice", at=30, lasts=5)
+    stream.prompt("a person sits down", at=35, lasts=40)
+    expected = np.stack([next(stream) for _ in range(75)])
+    np.testing.assert_allclose([frame["joints"] for frame in frames], expected, atol=2e-4)
+
+    (here / "plan.tsv").write_text(TIMELINE)
+    for name in ("walk.npy", "walk.jsonl"):
+        assert cli.main(["stream", "plan.tsv", "--out", name, *FLAGS]) == 0
+        assert f"wrote {name} (75 frames, 3.8 s)" in capsys.readouterr().err
+    np.testing.assert_allclose(np.load("walk.npy", allow_pickle=False), expected, atol=1e-4)
+    assert [json.loads(line) for line in open("walk.jsonl")] == frames
+    assert sorted(path.name for path in here.iterdir()) == ["plan.tsv", "walk.jsonl", "walk.npy"]
+
+
+def test_lines_are_read_no_sooner_than_needed(here, monkeypatch, capsys):
+    """Whoever types the next line sees the frames of the last one first, but for those that must hear the next."""
+    printed = []
+
+    def typed():
+        for line in TIMELINE.splitlines(keepends=True) * 2:
+            printed.append(capsys.readouterr().out.count("\n"))
+            yield line
+
+    monkeypatch.setattr("sys.stdin", typed())
+    assert cli.main(["stream", "--steps", "6", "--uncertainty", "6"]) == 0  # one latent in flight: 4 frames ahead
+    waits = np.cumsum(printed)
+    assert waits.tolist() == [0, 27, 27, 32, 72, 102, 102, 107]
+
+
+@pytest.mark.parametrize(
+    "arguments, text, message",
+    [
+        ([], "", "no prompt came"),
+        ([], "a person walks", "line 1: expected seconds"),
+        ([], "1\twalk\n-3\twalk\n", "line 2"),
+        ([], "inf\twalk", "line 1"),
+        ([], "nan\twalk", "line 1"),
+        ([], "2\t ", "line 1"),
+        (["missing.tsv"], "", "no file missing.tsv"),
+        (["bad.tsv", "--out", "new.npy"], "", "line 2"),
+        (["--out", "walk.gif"], TIMELINE, ".jsonl, .npy"),
+        (["--schedule", "full"], TIMELINE, "needs an end"),
+        (["--window", "3"], TIMELINE, "too small"),
+    ],
+)
+def test_what_cannot_be_streamed_ends_in_one_line(here, monkeypatch, capsys, arguments, text, message):
+    (here / "bad.tsv").write_text("1\ta person walks\nwalk on\n")
+    listen_to(text, monkeypatch)
+    assert cli.main(["stream", *arguments]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("minicmdm: ") and said.count("\n") == 1 and message in said
+    assert [path.name for path in here.iterdir()] == ["bad.tsv"]
