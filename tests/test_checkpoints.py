@@ -45,7 +45,9 @@ def test_whole_checkpoint_loads(tiny_run, tiny_preset):
     assert not (checkpoint.vae.training or checkpoint.dit.training or checkpoint.text.training)
     card = checkpoint.card
     assert card["data"]["fingerprint"] == "fake" and card["seed"] == 0
-    assert set(card["seconds"]) == {"evaluator", "tmr", "vae", "dit"} and {"mpjpe_mm", "val_loss"} <= set(card["metrics"])
+    assert set(card["seconds"]) == {"evaluator", "tmr", "vae", "dit"} and {"mpjpe_mm", "val_loss"} <= set(
+        card["metrics"]
+    )
     assert not list(tiny_run.glob("**/.minicmdm-*"))
 
 
