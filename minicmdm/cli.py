@@ -104,7 +104,7 @@ def _parser() -> Parser:
     sub.add_argument("--steps", type=int, default=6, help="K (default 6)")
     sub.add_argument("--uncertainty", type=int, default=2, help="L (default 2)")
     sub.add_argument("--block", type=int, default=1, help="latents per block (default 1)")
-    sub.add_argument("--kind", default="fss", help="fss, full or autoregressive (default fss)")
+    sub.add_argument("--kind", default="fss", help="fss, full, autoregressive, triangular or trapezoid (default fss)")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
     data = commands.add_parser("data", help="Make data sets.", description="Make data sets.", allow_abbrev=False)
@@ -130,7 +130,7 @@ def _parser() -> Parser:
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")
     sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
     sub.add_argument("--protocol", help="t2m (text to motion) or recon (the VAE and back); both if not given")
-    sub.add_argument("--schedule", help="fss, full or autoregressive (default fss)")
+    sub.add_argument("--schedule", help="fss, full, autoregressive, triangular or trapezoid (default fss)")
     sub.add_argument("--steps", type=int, help="K (default 20)")
     sub.add_argument("--uncertainty", type=int, help="L (default 2)")
     sub.add_argument("--guidance", type=float, help="guidance scale (default 3)")

@@ -63,7 +63,7 @@ class DiTConfig:
     heads: int = 4
     time_dim: int = 256
     block_size: int = 1  # latents that see each other both ways: 1 is the paper's text, 3 the released code
-    attention: str = "causal"  # or "bidirectional"
+    attention: str = "causal"  # or "bidirectional", or "window"
     text_layers: int = 0  # self-attention among the words of a sentence before latents see them (ours)
     clock: bool = False  # True (ours): each latent knows how far into its sentence it is, and what is left if known
 
