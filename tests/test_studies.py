@@ -96,9 +96,7 @@ def test_intervals_and_correlations_against_hand_computed_ones():
     assert studies.correlation(np.arange(12.0), -np.exp(np.arange(12.0))).startswith("-1.00")
 
 
-@pytest.mark.parametrize("name", studies.ROWS)
+@pytest.mark.parametrize("name", [name for name in studies.ROWS if studies.read(name)])
 def test_committed_rows_can_be_told(name):
     rows = studies.read(name)
-    if not rows:
-        pytest.skip(f"the study {name} has no committed CSV yet")
-    assert len(studies.summary(name, rows).splitlines()) >= 2
+    assert len(studies.summary(name, rows).splitlines()) > len(rows)
