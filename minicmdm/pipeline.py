@@ -5,7 +5,7 @@
 
 A motion depends on its own prompt, length and seed, and never on what else is in its batch: each prompt has its own
 generator, and the noise for the longest motion is drawn first and then cut. As the model is causal, a longer motion
-of the same prompt and seed therefore begins like the shorter one.
+of the same prompt and seed begins like the shorter one, unless the model is told how long it is to be (`tell_length`).
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class MotionPipeline:
     ) -> Motion | list[Motion]:
         """Generate a Motion for a prompt, or a list of them for a list of prompts.
 
-        `num_frames` (4..196 at 20 fps) and `seed` are one for all or one for each. `schedule` is "fss", "full" or
-        "autoregressive", with K = `num_steps` and L = `uncertainty`; `block_size` is the model's own unless given.
+        `num_frames` (4..196 at 20 fps) and `seed` are one for all or one for each. `schedule` is one of
+        `schedules.KINDS`, with K = `num_steps` and L = `uncertainty`; `block_size` is the model's own unless given.
         With `tell_length` a model that has a clock knows how long the motion is to be, and paces itself; without, a
         longer motion begins exactly like a shorter one.
         Raises ValueError for anything that cannot be asked.

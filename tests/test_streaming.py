@@ -357,6 +357,8 @@ def test_the_horizon_is_early_enough_for_any_schedule(pipe):
         for frame in range(40):
             stream.prompt("a person sits", at=frame + stream.horizon, lasts=20)  # never too late
             next(stream)
+        with pytest.raises(ValueError, match="started already"):  # and what is too late is refused
+            stream.prompt("a person sits", at=36)
 
 
 def test_joints_in_pieces_are_joints_in_one_go():

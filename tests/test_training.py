@@ -13,7 +13,6 @@ import torch
 from conftest import make_fake_data
 from torch import nn
 
-from minicmdm.data.features import features_to_joints
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import WordCache, Words
 from minicmdm.models.vae import MACVAE, vae_loss
@@ -175,14 +174,7 @@ def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
         assert loss().item() < before - 0.2
 
 
-def test_mpjpe_is_in_millimetres_and_blind_to_the_pelvis(fake_data):
-    joints = features_to_joints(fake_data.clips[0].features)
-    moved = joints + [3.0, 0.0, -2.0]
-    assert representation.pelvis_distance(joints, moved).max() < 1e-6
-    one_off = joints.copy()
-    one_off[:, 5, 1] += 0.022
-    np.testing.assert_allclose(representation.pelvis_distance(joints, one_off), 0.001, atol=1e-9)
-
+def test_a_perfect_vae_has_no_error(fake_data):
     class Perfect(nn.Module):
         def encode(self, x):
             return x, x

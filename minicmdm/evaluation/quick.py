@@ -17,7 +17,7 @@ from minicmdm.data.dataset import Clip, toy_dataset, world_fingerprint
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
 from minicmdm.data.programs import Program
-from minicmdm.evaluation.metrics import clip_accuracy, field_accuracy, segment_accuracy
+from minicmdm.evaluation.metrics import clip_accuracy, field_accuracy, mpjpe, segment_accuracy
 
 if TYPE_CHECKING:
     from minicmdm.pipeline import MotionPipeline
@@ -143,8 +143,7 @@ def reconstruction_error(pipe: MotionPipeline, clip: Clip) -> float:
     """Mean joint error (mm) of one clip through the VAE and back, both aligned at the pelvis in every frame."""
     rebuilt = features_to_joints(pipe.reconstruct(clip.features))  # (T,22,3)
     truth = features_to_joints(clip.features[: len(rebuilt)].astype(np.float64))
-    gap = (rebuilt - rebuilt[:, :1]) - (truth - truth[:, :1])
-    return float(np.linalg.norm(gap, axis=-1).mean() * 1000)
+    return 1000 * mpjpe(rebuilt, truth)
 
 
 def _read(joints: np.ndarray) -> Program:

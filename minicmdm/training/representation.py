@@ -20,7 +20,7 @@ from minicmdm.alignment import adaptive_weight, alignment_loss, group_mean
 from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
 from minicmdm.data.features import features_to_joints
-from minicmdm.evaluation.metrics import r_precision
+from minicmdm.evaluation.metrics import mpjpe, r_precision
 from minicmdm.models.text import TextEncoder
 from minicmdm.models.tmr import MotionTeacher, contrastive_loss
 from minicmdm.models.vae import MACVAE, vae_loss
@@ -165,12 +165,6 @@ def reconstruction_mpjpe(
         x = torch.from_numpy(clip.features[:length])
         recon = vae.decode(vae.encode(((x - mean) / std)[None])[0])[0] * std + mean  # (T,D)
         truth, guess = features_to_joints(clip.features[:length]), features_to_joints(recon.numpy())  # (T,22,3)
-        total += pelvis_distance(truth, guess).sum()
+        total += length * mpjpe(guess, truth)
         frames += length
     return float(1000 * total / frames)
-
-
-def pelvis_distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Per frame, the mean joint distance in metres after moving pelvis onto pelvis. (T,22,3) twice -> (T,)."""
-    apart = (a - a[:, :1]) - (b - b[:, :1])
-    return np.linalg.norm(apart, axis=-1).mean(-1)
