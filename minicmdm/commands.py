@@ -221,6 +221,7 @@ def train(arguments: argparse.Namespace) -> None:
         fast=arguments.fast,
         data=arguments.data,
         seed=arguments.seed,
+        compile=arguments.compile,
         command=" ".join(["minicmdm train", *flags]),
         say=say,
     )

@@ -78,6 +78,7 @@ class TrainConfig:
 
     seed: int = 0
     bfloat16: bool = False  # autocast the forward pass; the weights and the optimiser stay float32
+    compile: bool = False  # torch.compile the denoiser's blocks while they train; needs a C++ compiler
     # stage 1: the evaluators
     evaluator_steps: int = 20_000
     evaluator_batch: int = 128
@@ -102,6 +103,7 @@ class TrainConfig:
     dit_batch: int = 64
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
+    levels: str = "random"  # of the latents: independent (CMDM Alg. 1), or "staircase", as FSS will present them
     ema: float = 0.9999
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
     # all
@@ -196,7 +198,7 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=6_500,
+            dit_steps=7_500,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,

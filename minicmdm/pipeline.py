@@ -149,16 +149,14 @@ class MotionPipeline:
         def read(sentences: list[str]) -> Words:
             for sentence in sentences:
                 self._check_prompt(sentence)
-            return self.text.encode(sentences)
+            return self._read(sentences)
 
-        with torch.no_grad():
-            null = self.text.encode([""])
         for text in prompts:
             self._check_prompt(text)
         latents = LatentStream(
             self.dit,
             read,
-            null,
+            self._read([""]),
             prompts,
             [torch.Generator().manual_seed(s) for s in seeds],
             schedule=schedule,
@@ -178,8 +176,8 @@ class MotionPipeline:
         self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float, tell_length: bool
     ) -> np.ndarray:
         batch, num_latents, _ = noise.shape
-        words = self.text.encode(prompts)  # (B,S,E), (B,S)
-        null = self.text.encode([""])  # (1,2,E): what the model saw when its text was dropped
+        words = self._read(prompts)  # (B,S,E), (B,S)
+        null = self._read([""])  # (1,2,E): what the model saw when its text was dropped
         mask = words.mask[:, None, :].expand(-1, num_latents, -1)  # (B,N,S): every latent sees the whole sentence
         null_mask = null.mask[:, None, :].expand(batch, num_latents, -1)
         null_words = null.embeddings.expand(batch, -1, -1)
@@ -189,6 +187,10 @@ class MotionPipeline:
         denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid, clock)
         latents = sample(denoise, matrix, noise)  # (B,N,C)
         return self.decode(latents).numpy()
+
+    @torch.no_grad()
+    def _read(self, sentences: list[str]) -> Words:
+        return self.dit.read(self.text.encode(sentences))
 
     @torch.no_grad()
     def encode(self, features: np.ndarray | Tensor) -> Tensor:

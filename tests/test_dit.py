@@ -7,7 +7,8 @@ import torch
 from model_helpers import dependencies, lower_triangle, randomise
 
 from minicmdm.config import DiTConfig
-from minicmdm.models.dit import CausalDiT, draw_boundary, self_attention_mask
+from minicmdm.models.dit import CausalDiT, self_attention_mask
+from minicmdm.models.text import Words
 
 TINY = DiTConfig(latent_dim=3, text_dim=5, dim=16, layers=2, heads=2, time_dim=8)
 
@@ -68,20 +69,6 @@ def test_a_window_model_takes_clean_latents_for_the_past(finished):
     assert torch.equal(model(z_t, t, words, mask), model(z_t, t, words, mask, committed=committed))
     everything = torch.zeros_like(committed)  # the control: who is committed can be said, and then it counts
     assert dependencies(lambda z: model(z, t, words, mask, committed=everything), z_t).all()
-
-
-def test_the_boundary_of_training_is_drawn_everywhere():
-    valid = torch.arange(10) < torch.tensor([10, 7, 1])[:, None].repeat(1, 1).repeat_interleave(2000, 0)
-    committed, visible = draw_boundary(valid, 3, torch.Generator().manual_seed(0))
-    past, shown = committed.sum(1), visible.sum(1)
-    place = torch.arange(10)
-    assert torch.equal(committed, place < past[:, None]) and torch.equal(visible, place < shown[:, None])
-    assert (past < shown).all() and (visible <= valid).all()  # somebody is in flight, and no padding is
-    assert set(past[:2000].tolist()) == {0, 3, 6, 9} and set(shown[:2000].tolist()) == {3, 6, 9, 10}
-    assert set(shown[2000:4000].tolist()) == {3, 6, 7} and set(shown[4000:].tolist()) == {1}
-    assert abs((past[:2000] == 0).float().mean() - (1 / 4 + 3 / 4 / 4)) < 0.05
-    again = draw_boundary(valid, 3, torch.Generator().manual_seed(0))
-    assert torch.equal(again[0], committed) and torch.equal(again[1], visible)
 
 
 def test_dropping_the_future_changes_nothing(model):
@@ -160,17 +147,19 @@ def test_unknown_attention_and_block_size():
 
 
 def test_words_read_their_own_sentence_only():
-    """Two sentences side by side: no word of one, nor padding that nobody sees, changes how the other is read."""
-    model = randomise(CausalDiT(replace(TINY, text_layers=2, attention="bidirectional", layers=1)))
-    z_t, t, words, mask = inputs(latents=4, words=7)
-    mask[:] = False
-    mask[:, :2, :3] = mask[:, 2:, 3:6] = True  # the seventh word is padding
-    keys = torch.cat([k.transpose(1, 2).flatten(2) for k, _ in model.read_words(words, mask)], -1)
-    assert keys.shape == (1, 7, TINY.dim)
-    seen = dependencies(lambda w: model.read_words(w, mask)[0][0].transpose(1, 2).flatten(2), words)
-    expected = torch.zeros(7, 7, dtype=torch.bool)
-    expected[:3, :3] = expected[3:6, 3:6] = True
-    expected[6, 6] = True
-    assert torch.equal(seen, expected)
-    alone = model.read_words(words[:, 3:6])[0][1]  # as a stream reads one prompt: no mask, nothing before it
-    torch.testing.assert_close(model.read_words(words, mask)[0][1][:, :, 3:6], alone, rtol=1e-9, atol=1e-9)
+    """No word of another sentence, nor padding, changes how a sentence is read; its own words all do."""
+    model = randomise(CausalDiT(replace(TINY, text_layers=2, text_dim=8)))
+    torch.manual_seed(0)
+    words = Words(torch.randn(2, 5, 8, dtype=torch.float64), torch.tensor([[True] * 3 + [False] * 2, [True] * 5]))
+
+    def read(x):  # (1,10,8): the words of both, one after the other; a LayerNorm would not feel a constant added
+        return model.read(Words((x * torch.arange(8)).view(2, 5, 8), words.mask)).embeddings.view(1, 10, 8)
+
+    seen = dependencies(read, words.embeddings.view(1, 10, 8))
+    expected = torch.zeros(10, 10, dtype=torch.bool)
+    expected[:3, :3] = expected[5:, 5:] = True
+    assert torch.equal(seen[:3], expected[:3]) and torch.equal(seen[5:], expected[5:])  # rows 3 and 4 are padding
+    alone = model.read(Words(words.embeddings[:1, :3], words.mask[:1, :3]))
+    torch.testing.assert_close(model.read(words).embeddings[:1, :3], alone.embeddings, rtol=1e-9, atol=1e-9)
+    swapped = Words(words.embeddings[1:, [1, 0, 2, 3, 4]], words.mask[1:])  # order matters: not a bag of words
+    assert not torch.allclose(model.read(swapped).embeddings[:, 2:], model.read(words).embeddings[1:, 2:])

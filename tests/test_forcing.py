@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_times
+from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase, draw_times
 from minicmdm.diffusion.path import cosine_alpha_bar, data_to_velocity
-from minicmdm.models.dit import draw_boundary
 
 
 def seeded(seed=0):
@@ -130,3 +129,40 @@ def test_the_committed_are_given_clean_and_are_not_asked_for(path):
     assert committed.any() and not visible.all() and told is committed and loss.isfinite() and loss > 0.5
     assert torch.equal(x[committed], z[committed]) and (t[committed] == 1).all()
     assert (t[~committed] < 1).float().mean() > 0.9
+
+
+def test_the_boundary_of_training_is_drawn_everywhere():
+    valid = torch.arange(10) < torch.tensor([10, 7, 1])[:, None].repeat(1, 1).repeat_interleave(2000, 0)
+    committed, visible = draw_boundary(valid, 3, seeded())
+    past, shown = committed.sum(1), visible.sum(1)
+    place = torch.arange(10)
+    assert torch.equal(committed, place < past[:, None]) and torch.equal(visible, place < shown[:, None])
+    assert (past < shown).all() and (visible <= valid).all()  # somebody is in flight, and no padding is
+    assert set(past[:2000].tolist()) == {0, 3, 6, 9} and set(shown[:2000].tolist()) == {3, 6, 9, 10}
+    assert set(shown[2000:4000].tolist()) == {3, 6, 7} and set(shown[4000:].tolist()) == {1}
+    assert abs((past[:2000] == 0).float().mean() - (1 / 4 + 3 / 4 / 4)) < 0.05
+    again = draw_boundary(valid, 3, seeded())
+    assert torch.equal(again[0], committed) and torch.equal(again[1], visible)
+
+
+def test_the_staircase_is_what_fss_presents():
+    """Finished, then times falling by one height, then nothing; and a sampler's rows are among what is drawn."""
+    valid = torch.arange(12) < torch.tensor([12, 5])[:, None].repeat_interleave(3000, 0)
+    t, committed, visible = draw_staircase(valid, 2, seeded())
+    past, shown = committed.sum(1), visible.sum(1)
+    place = torch.arange(12)
+    assert torch.equal(committed, place < past[:, None]) and torch.equal(visible, place < shown[:, None])
+    assert (past < shown).all() and (visible <= valid).all()
+    assert (t[committed] == 1).all() and (t[~committed] < 1).all() and t.min() >= 0
+    assert torch.equal(t[:, 0::2][:3000], t[:, 1::2][:3000])  # one level a block
+    steps = t[:3000, 0::2].diff(dim=1)  # (B,5)
+    moving = ~committed[:3000, 0:-2:2] & visible[:3000, 2::2]  # both neighbours are in flight
+    heights = -steps[moving]
+    assert (heights > 0.03).all() and (heights < 1).all() and heights.min() < 0.07
+    some = moving.sum(1) >= 2  # every step of one sample is as high as the others, up to the rounding of times
+    spread = torch.where(moving, steps, torch.nan)[some]
+    assert (spread.nan_to_num(-9).amax(1) - spread.nan_to_num(9).amin(1) < 2.01 / 64).all()
+    begun = t[:3000][past[:3000] == 0][:, 0]  # with no past the first one may be anywhere on its way
+    assert abs(begun.mean() - 0.5) < 0.05
+    front = t[:3000].gather(1, past[:3000, None].clamp(max=11))[past[:3000] > 0]
+    assert front.mean() > 0.75  # with a past it starts from where the last step of its neighbour left it

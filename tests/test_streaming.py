@@ -113,7 +113,6 @@ def cases(draw):
     attention = draw(st.sampled_from(["causal", "bidirectional", "window"]))
     cfg = replace(TINY, attention=attention, block_size=draw(st.integers(1, 3)), clock=draw(st.booleans()))
     cfg = replace(cfg, layers=draw(st.integers(1, 3)), heads=draw(st.sampled_from([1, 2, 4])))
-    cfg = replace(cfg, text_layers=draw(st.integers(0, 1)))
     num_steps = draw(st.integers(1, 6))
     how = dict(schedule=draw(st.sampled_from(["full", "fss", "autoregressive", "triangular"])), num_steps=num_steps)
     how |= dict(uncertainty=draw(st.integers(0, num_steps)), block_size=draw(st.integers(1, 4)))
@@ -347,7 +346,7 @@ def test_the_reaction_is_as_long_as_it_says(pipe, reach):
     reaction = second.reaction
     second.prompt("a person jumps")
     change = [np.abs(next(first) - next(second)).max() for _ in range(reaction + 4)]
-    assert max(change[:reaction], default=0) == 0 and max(change[reaction:]) > 1e-6
+    assert max(change[:reaction], default=0) < 1e-5 and max(change[reaction:]) > 1e-3  # rounding, and another motion
     assert reaction == {"new": 2 + 4 * 2, "active": 2}[reach]  # two frames of a latent are left, two latents in flight
 
 

@@ -26,6 +26,49 @@ def draw_times(batch: int, num_latents: int, block_size: int, generator: torch.G
     return t.repeat_interleave(block_size, dim=1)[:, :num_latents]  # (B,N)
 
 
+def draw_boundary(
+    valid: Tensor, block_size: int = 1, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor]:
+    """For training the "window" mask: draw where the committed past ends and where the visible future ends.
+
+    valid (B,N) -> committed and visible, (B,N) bool each, both cut between blocks. A quarter of the samples have no
+    past, as a motion has at its start, and the others any; half of the samples show all that is left, and the others
+    any part of it, since a sampler hides what still waits. At least one block is in flight.
+    """
+    past, blocks, luck = _draw_past(valid, block_size, generator)
+    shown = past + 1 + (luck[:, 1] * (blocks - past)).long().clamp(max=blocks - past - 1)  # (B,), past+1 .. blocks
+    shown = torch.where(luck[:, 2] < 0.5, blocks, shown)
+    block = torch.arange(valid.shape[1], device=valid.device) // block_size  # (N,)
+    return valid & (block < past[:, None]), valid & (block < shown[:, None])
+
+
+def draw_staircase(
+    valid: Tensor, block_size: int = 1, generator: torch.Generator | None = None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Levels as FSS presents them: finished latents, a staircase of times falling to 0, and the rest hidden.
+
+    valid (B,N) -> times (B,N), committed and visible (B,N) bool. Each sample draws the height L/K of its steps, from a
+    twentieth to all of the way (autoregressive), its past, and how far its first latent in flight has come.
+    """
+    past, _, luck = _draw_past(valid, block_size, generator)
+    height = 0.05 ** luck[:, 1]  # (B,), as many between .05 and .22 as between .22 and 1
+    front = luck[:, 2] * torch.where(past > 0, height, 1.0)  # what the first one in flight still has to go
+    block = torch.arange(valid.shape[1], device=valid.device) // block_size  # (N,)
+    t = 1 - front[:, None] - (block - past[:, None]) * height[:, None]  # (B,N)
+    committed, visible = valid & (block < past[:, None]), valid & (t > 0)
+    t = (t.clamp(0, 1) * LEVELS).floor() / LEVELS  # few different ones, see `draw_times`
+    return t.masked_fill(committed, 1.0), committed, visible
+
+
+def _draw_past(valid: Tensor, block_size: int, generator) -> tuple[Tensor, Tensor, Tensor]:
+    """How many blocks are finished (B,), how many there are (B,), and luck (B,3), of which the first is used up."""
+    device = generator.device if generator is not None else valid.device
+    luck = torch.rand(len(valid), 3, generator=generator, device=device).to(valid.device)
+    blocks = -(-valid.sum(1) // block_size)  # (B,)
+    past = ((luck[:, 0] * 4 - 1).clamp(min=0) / 3 * blocks).long().clamp(max=blocks - 1)  # (B,), 0 .. blocks-1
+    return past, blocks, luck
+
+
 def diffusion_forcing_loss(
     model,
     z: Tensor,
@@ -37,6 +80,7 @@ def diffusion_forcing_loss(
     clock: Tensor | None = None,
     path: str = "flow",
     committed: Tensor | None = None,
+    t: Tensor | None = None,
 ) -> Tensor:
     """The prediction's mean squared error over valid latents (CMDM Eq. 10, Alg. 1). Scalar.
 
@@ -45,11 +89,11 @@ def diffusion_forcing_loss(
     keeps the words, the per-latent mask and the null branch of guidance one and the same thing.
     path: "flow" asks for the velocity at t, as the release does; "ddpm" for the noise at integer levels k of 0..1000,
     as the paper writes, and tells the model 1 - k/1000.
-    committed (B,N): latents that are finished, for window attention (models/dit.py `draw_boundary`). They are given
-    clean, the model hears of them, and they do not count.
+    committed (B,N): latents that are finished (`draw_boundary`, `draw_staircase`). They are given clean, the model
+    hears of them, and they do not count. t (B,N): the times, drawn independently unless given.
     """
     batch, num_latents, _ = z.shape
-    t = draw_times(batch, num_latents, block_size, generator).to(z)
+    t = (draw_times(batch, num_latents, block_size, generator) if t is None else t).to(z)
     device = generator.device if generator is not None else z.device
     eps = torch.randn(z.shape, generator=generator, device=device).to(z)
     asked, more = valid, {}

@@ -65,9 +65,9 @@ class Said:
 class LatentStream:
     """B streams of latents in step, each with its own noise and its own sentences; `step` is one call of the denoiser.
 
-    read: B sentences -> Words; null: the Words of "". `num_latents` gives it an end ("full" needs one). `window` is
-    LONGEST unless given, or what is in flight if that is more. ValueError: a schedule that cannot stream, a window that
-    is smaller than what is in flight, an unknown `new_prompt`.
+    read: B sentences -> Words, as `dit.read` returns them; null: those of "". `num_latents` gives it an end ("full"
+    needs one). `window` is LONGEST unless given, or what is in flight if that is more. ValueError: a schedule that
+    cannot stream, a window that is smaller than what is in flight, an unknown `new_prompt`.
     """
 
     def __init__(
@@ -263,4 +263,4 @@ class LatentStream:
         both = [[F.pad(x, (0, 0) * (x.ndim - 2) + (0, longest - x.shape[1])) for x in words] for words in read]
         embeddings, real = (torch.cat(parts) for parts in zip(*both))  # (R,S,E), (R,S)
         embeddings, real = embeddings.to(self.z.device, self.model_dtype), real.to(self.z.device)
-        return self.dit.read_words(embeddings, real.unsqueeze(1)), real
+        return self.dit.keys_values(embeddings), real

@@ -11,7 +11,7 @@ forcing needs that, as neighbours stand at different levels. They start at zero,
 layer, so a new model predicts zero and each block starts as its cross-attention alone.
 
 `forward` is for training and for samplers that know the whole motion. A stream (diffusion/streaming.py) calls
-its parts: what depends on the noise level alone (`modulations`), on the words alone (`read_words`), and the
+its parts: what depends on the noise level alone (`modulations`), on the words alone (`read`, `keys_values`), and the
 rest (`evaluate`), which can leave the keys and values of finished latents in a cache.
 """
 
@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from minicmdm.config import DiTConfig
 from minicmdm.models.layers import Attention, KeyValueCache, Turns, modulate, sinusoid, turns
+from minicmdm.models.text import Words
 
 ATTENTION = ("causal", "bidirectional", "window")
 CLOCK_DIM = 64  # waves for each of the clock's two numbers
@@ -57,27 +58,6 @@ def self_attention_mask(
     if valid is not None:
         mask = mask & valid.unsqueeze(1)  # (B,1,N): padding is never looked at
     return mask
-
-
-def draw_boundary(
-    valid: Tensor, block_size: int = 1, generator: torch.Generator | None = None
-) -> tuple[Tensor, Tensor]:
-    """For training the "window" mask: draw where the committed past ends and where the visible future ends.
-
-    valid (B,N) -> committed and visible, (B,N) bool each, both cut between blocks. A quarter of the samples have no
-    past, as a motion has at its start, and the others any; half of the samples show all that is left, and the others
-    any part of it, since a sampler hides what still waits. At least one block is in flight. The caller gives committed
-    latents t = 1 and no noise, hides what is not visible (`valid`), and counts the loss on visible & ~committed.
-    """
-    batch, num_latents = valid.shape
-    device = generator.device if generator is not None else valid.device
-    luck = torch.rand(batch, 3, generator=generator, device=device).to(valid.device)
-    blocks = -(-valid.sum(1) // block_size)  # (B,)
-    past = ((luck[:, 0] * 4 - 1).clamp(min=0) / 3 * blocks).long().clamp(max=blocks - 1)  # (B,), 0 .. blocks-1
-    shown = past + 1 + (luck[:, 1] * (blocks - past)).long().clamp(max=blocks - past - 1)  # (B,), past+1 .. blocks
-    shown = torch.where(luck[:, 2] < 0.5, blocks, shown)
-    block = torch.arange(num_latents, device=valid.device) // block_size  # (N,)
-    return valid & (block < past[:, None]), valid & (block < shown[:, None])
 
 
 def clock_features(t: Tensor, clock: Tensor | None) -> Tensor:
@@ -134,17 +114,17 @@ class Block(nn.Module):
 
 
 class WordBlock(nn.Module):
-    """Words look at the words of their own sentence: who turns, to which side, how often. (B,S,dim) -> (B,S,dim).
+    """Words look at the words of their own sentence: who turns, to which side, how often. (B,S,E) -> (B,S,E).
 
     A text encoder learnt by contrast and then frozen need only say which sentence is whose, and hardly tells which word
     goes with which; the denoiser has to know. The paper reads a frozen DistilBERT's words as they are.
     """
 
-    def __init__(self, dim: int, heads: int, feedforward_dim: int):
+    def __init__(self, dim: int, heads: int):
         super().__init__()
         self.norm1, self.attention = nn.LayerNorm(dim), Attention(dim, heads)
         self.norm2 = nn.LayerNorm(dim)
-        self.feedforward = nn.Sequential(nn.Linear(dim, feedforward_dim), nn.GELU(), nn.Linear(feedforward_dim, dim))
+        self.feedforward = nn.Sequential(nn.Linear(dim, 2 * dim), nn.GELU(), nn.Linear(2 * dim, dim))
 
     def forward(self, x: Tensor, mask: Tensor | None, positions: Tensor) -> Tensor:
         h = self.norm1(x)
@@ -164,9 +144,7 @@ class CausalDiT(nn.Module):
         self.cfg = cfg
         self.embed_latent = nn.Linear(cfg.latent_dim, cfg.dim)
         self.embed_words = nn.Linear(cfg.text_dim, cfg.dim)
-        self.word_blocks = nn.ModuleList(
-            WordBlock(cfg.dim, cfg.heads, cfg.feedforward_dim) for _ in range(cfg.text_layers)
-        )
+        self.word_blocks = nn.ModuleList(WordBlock(cfg.text_dim, cfg.heads) for _ in range(cfg.text_layers))
         if cfg.clock:
             self.embed_clock = nn.Linear(2 * CLOCK_DIM + 1, cfg.dim)
         # AdaLN is SiLU and linear in every block; the SiLU is the same for all of them, so it is done here, once.
@@ -190,8 +168,8 @@ class CausalDiT(nn.Module):
     ) -> Tensor:
         """Predict the velocity of every latent.
 
-        z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,E) with word_mask (B,N,S), True where latent n
-        may see word s (a row without any True sees no words at all); valid (B,N), False on padding; clock
+        z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,E) that `read` has seen, with word_mask (B,N,S), True where
+        latent n may see word s (a row without any True sees no words at all); valid (B,N), False on padding; clock
         (B,N,2), see `clock_features`, read only by a model that has one; committed (B,N), the finished past under the
         "window" mask, by default those at t = 1. -> (B,N,C).
         """
@@ -205,9 +183,7 @@ class CausalDiT(nn.Module):
         levels, which = t.unique(return_inverse=True)  # (U,), and for every latent its place there (B,N)
         told = clock_features(t, clock) if self.cfg.clock else None
         modulations = self.modulations(levels)
-        return self.evaluate(
-            z_t, which, modulations, self.read_words(words, word_mask), word_mask, mask, positions, told
-        )
+        return self.evaluate(z_t, which, modulations, self.keys_values(words), word_mask, mask, positions, told)
 
     def modulations(self, levels: Tensor) -> list[Tensor]:
         """What every block makes of the times (U,): its six modulation vectors, (U,6*dim) each."""
@@ -218,18 +194,19 @@ class CausalDiT(nn.Module):
         time = self.embed_time(waves)  # (U,time_dim) -> (U,dim)
         return [block.modulation(time) for block in self.blocks]
 
-    def read_words(self, words: Tensor, word_mask: Tensor | None = None) -> list[tuple[Tensor, Tensor]]:
-        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each.
+    def read(self, words: Words) -> Words:
+        """Sentences (U,S,E) as a text encoder leaves them -> as `forward` wants them: their words have met each other.
 
-        Two words belong together if some latent sees both by word_mask (B,N,S); without it all of a row's do.
+        It depends on the sentence alone, so it is done once for each, before sentences are laid side by side.
         """
-        together = None
-        if word_mask is not None and len(self.word_blocks):
-            seen = word_mask.to(words.dtype)
-            together = seen.transpose(1, 2) @ seen > 0  # (B,N,S) -> (B,S,S)
-        words = self.embed_words(words)  # (B,S,E) -> (B,S,dim)
+        x, mask = words
         for block in self.word_blocks:
-            words = block(words, together, torch.arange(words.shape[1], device=words.device))
+            x = block(x, mask[:, None, :], torch.arange(x.shape[1], device=x.device))
+        return Words(x, mask)
+
+    def keys_values(self, words: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each."""
+        words = self.embed_words(words)  # (B,S,E) -> (B,S,dim)
         return [block.cross_attention.keys_values(words) for block in self.blocks]
 
     def evaluate(
@@ -246,7 +223,7 @@ class CausalDiT(nn.Module):
     ) -> Tensor:
         """The velocity (B,N,C) of latents z_t (B,N,C) at positions (N,), the rest of the work being done.
 
-        which (B,N) numbers the rows of `modulations`; `words` comes from `read_words`, with word_mask (B,N,S); mask
+        which (B,N) numbers the rows of `modulations`; `words` comes from `keys_values`, with word_mask (B,N,S); mask
         (N,N') or (B,N,N') covers the N' - N latents of the cache first; told (B,N,.) are `clock_features`. Masks as in
         `Attention.attend`.
         """

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from minicmdm.data.dataset import Clip, MotionDataset
@@ -225,13 +226,13 @@ def words_per_latent(words: Words, choice: Tensor, owner: Tensor) -> tuple[Tenso
     `words` are the batch's different sentences, encoded one by one: embeddings (U,S1,E), mask (U,S1). Returns words
     (B,S,E) and mask (B,N,S), where S counts the real words of the sample that has most.
     """
-    length, width = words.embeddings.shape[1:]
+    length = words.mask.shape[1]
     rows = choice.clamp(min=0)  # (B,R)
     real = (words.mask[rows] & (choice >= 0)[..., None]).flatten(1)  # (B,R,S1) -> (B,R*S1)
     most = int(real.sum(1).max())
     order = real.int().argsort(dim=1, descending=True, stable=True)[:, :most]  # (B,S): real words first, in order
-    flat = words.embeddings[rows].flatten(1, 2)  # (B,R,S1,E) -> (B,R*S1,E)
-    side_by_side = flat.gather(1, order[..., None].expand(-1, -1, width))  # (B,S,E)
     sentence = order // length  # (B,S): which of its sample's sentences a word belongs to
+    place = rows.gather(1, sentence) * length + order % length  # (B,S): where it stands among all words of the batch
+    side_by_side = F.embedding(place, words.embeddings.flatten(0, 1))  # (U*S1,E) -> (B,S,E)
     mask = real.gather(1, order)[:, None, :] & (sentence[:, None, :] == owner[:, :, None])  # (B,N,S)
     return side_by_side, mask

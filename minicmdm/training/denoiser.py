@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
-from minicmdm.diffusion.forcing import diffusion_forcing_loss
+from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder, WordCache
 from minicmdm.training import checkpoints
@@ -30,7 +30,11 @@ def train_dit(
     words = WordCache(TextEncoder.load(out / "text", plan.text), {"", *said(train_set), *said(val_set)})
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_key(cfg.seed, -2))
-        models = nn.ModuleDict({"dit": CausalDiT(plan.dit)})
+        dit = CausalDiT(plan.dit)
+    if cfg.compile:  # the elementwise work between the matmuls, more than half of a step, becomes a few loops
+        for block in (*dit.blocks, *dit.word_blocks):
+            block.compile(dynamic=True)
+    models = nn.ModuleDict({"dit": dit})
 
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         return denoising_loss(models["dit"], words, latents, plan, cfg.dit_batch, cfg.text_drop, generator), {}
@@ -63,8 +67,14 @@ def denoising_loss(
 ) -> Tensor:
     """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent."""
     batch = draw_batch(latents, count, drop, generator)
-    seen, mask = words_per_latent(words.encode(batch.sentences), batch.choice, batch.owner)  # (B,S,E), (B,N,S)
+    t, committed, visible, block_size = None, None, batch.valid, plan.dit.block_size
+    if plan.train.levels == "staircase":
+        t, committed, visible = draw_staircase(batch.valid, block_size, generator)
+    elif plan.dit.attention == "window":
+        committed, visible = draw_boundary(batch.valid, block_size, generator)
     with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
+        read = dit.read(words.encode(batch.sentences))  # each different sentence once: (U,S1,E), (U,S1)
+        seen, mask = words_per_latent(read, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
         return diffusion_forcing_loss(
-            dit, batch.z, seen, mask, batch.valid, plan.dit.block_size, generator, batch.clock
+            dit, batch.z, seen, mask, visible, block_size, generator, batch.clock, committed=committed, t=t
         )

@@ -42,19 +42,22 @@ def train(
     fast: bool = False,
     data: str | Path | None = None,
     seed: int | None = None,
+    compile: bool = False,
     progress: bool = True,
     command: str = "",
     say: Say = lambda line: None,
 ) -> Path:
     """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
-    `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds.
+    `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
+    `compile` makes the denoiser's steps about a quarter shorter, where there is a C++ compiler.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """
     plan = preset(preset_name) if isinstance(preset_name, str) else preset_name
     if stage not in STAGES:
         raise ValueError(f"unknown stage {stage!r}: expected one of {', '.join(STAGES)}")
-    plan = replace(plan, train=replace(plan.train, seed=plan.train.seed if seed is None else seed))
+    own = {"seed": plan.train.seed if seed is None else seed, "compile": compile or plan.train.compile}
+    plan = replace(plan, train=replace(plan.train, **own))
     if fast:
         plan = replace(plan, train=replace(plan.train, **FAST))
     out = Path(out)
