@@ -1,4 +1,4 @@
-"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | train | evaluate`.
+"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | train | evaluate | bench`.
 
 Three habits hold for every command. What others parse (JSON, a matrix) goes to stdout; what people read while they wait
 goes to stderr. Whatever is wrong with a request is said in one line that begins "minicmdm: ", the exit code is 2, and
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from minicmdm.commands import data_make, demo, evaluate, generate, inspect, say, schedule, stream, train
+from minicmdm.commands import bench, data_make, demo, evaluate, generate, inspect, say, schedule, stream, train
 
 WRONG, INTERRUPTED, READER_GONE = 2, 130, 141  # exit codes; the last two are what a shell reports for the signals
 
@@ -130,12 +130,20 @@ def _parser() -> Parser:
 
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")
     sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
-    sub.add_argument("--protocol", help="t2m (text to motion) or recon (the VAE and back); both if not given")
+    sub.add_argument(
+        "--protocol",
+        help="t2m (text to motion), recon (the VAE and back), long (many prompts in a row) or mtt (timelines of "
+        "three); the first two if not given",
+    )
+    sub.add_argument("--compositions", type=int, help="long or mtt: how many (default 16 or 64; the papers' 64 or 500)")
+    sub.add_argument(
+        "--prompts-each", type=int, help="long or mtt: prompts in each (default 8 or 3; the papers' 32, 3)"
+    )
     sub.add_argument("--schedule", help="fss, full, autoregressive, triangular or trapezoid (default fss)")
     sub.add_argument("--steps", type=int, help="K (default 20)")
     sub.add_argument("--uncertainty", type=int, help="L (default 2)")
     sub.add_argument("--guidance", type=float, help="guidance scale (default 3)")
-    sub.add_argument("--repeats", type=int, help="how often all prompts are answered (default 5)")
+    sub.add_argument("--repeats", type=int, help="how often all prompts are answered, or others drawn (default 5)")
     sub.add_argument("--limit", type=int, help="only the first so many test clips, at least 32 unless --quick")
     sub.add_argument(
         "--evaluator", help="t2m or t2m_essential, the judge of 263 or 67 features (default t2m_essential)"
@@ -145,6 +153,12 @@ def _parser() -> Parser:
     form.add_argument("--table", action="store_true", help="print a table (this is the default)")
     form.add_argument("--json", action="store_true", help="print one JSON object")
     sub.add_argument("--out", help="write it too: .json, or .txt for the table")
+    sub.add_argument("--force", action="store_true", help="replace an output that exists")
+
+    sub = command("bench", bench, "Time the stream against the released sampler, the clock and itself (four minutes).")
+    sub.add_argument("--quick", action="store_true", help="fewer steps, one round, young streams: half a minute")
+    sub.add_argument("--json", action="store_true", help="print one JSON object")
+    sub.add_argument("--out", help="write it too: .json, or .txt for the list")
     sub.add_argument("--force", action="store_true", help="replace an output that exists")
     return parser
 

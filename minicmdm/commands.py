@@ -233,13 +233,13 @@ def evaluate(arguments: argparse.Namespace) -> None:
     from minicmdm.files import check_output, write_text
 
     out = None if arguments.out is None else check_output(arguments.out, (".json", ".txt"), arguments.force)
-    asked = {"protocol": arguments.protocol, "evaluator": arguments.evaluator, "repeats": arguments.repeats}
-    asked = {key: value for key, value in asked.items() if value is not None}
+    named = ("protocol", "evaluator", "repeats", "compositions", "prompts_each")
+    asked = {key: value for key in named if (value := getattr(arguments, key)) is not None}
     sampling = {"schedule": arguments.schedule, "num_steps": arguments.steps}
     sampling |= {"uncertainty": arguments.uncertainty, "guidance_scale": arguments.guidance}
     sampling = {key: value for key, value in sampling.items() if value is not None}
     if arguments.quick and (asked or arguments.table):
-        named = [f"--{key}" for key in asked] + ["--table"] * arguments.table
+        named = [f"--{key.replace('_', '-')}" for key in asked] + ["--table"] * arguments.table
         raise ValueError(f"--quick is a protocol of its own, with one flat list of numbers: leave out {named[0]}")
     if arguments.limit is not None and arguments.limit < 1:
         raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
@@ -263,5 +263,27 @@ def evaluate(arguments: argparse.Namespace) -> None:
         write_text(out, (json.dumps(result, indent=2) if out.suffix == ".json" else text) + "\n")
     encoding = getattr(sys.stdout, "encoding", None) or "ascii"  # a terminal without arrows gets question marks
     print(json.dumps(result) if arguments.json else text.encode(encoding, "replace").decode(encoding))
+    if out is not None:
+        say(f"wrote {out}")
+
+
+def bench(arguments: argparse.Namespace) -> None:
+    """`minicmdm bench`: what the stream saves, as one JSON object (a dot in a name is a level of it) or as a list."""
+    from minicmdm.files import check_output, write_text
+
+    out = None if arguments.out is None else check_output(arguments.out, (".json", ".txt"), arguments.force)
+    _one_thread()
+    from minicmdm.evaluation import bench as benchmark
+
+    result = benchmark.bench(benchmark.QUICK if arguments.quick else benchmark.FULL, say)
+    levels: dict = {}
+    for name, value in result.items():
+        group, _, leaf = name.rpartition(".")
+        (levels.setdefault(group, {}) if group else levels)[leaf] = value
+    short = json.loads(json.dumps(result), parse_float=lambda number: float(f"{float(number):.4g}"))
+    text = "\n".join(f"{name:28s} {value}" for name, value in short.items())
+    if out is not None:
+        write_text(out, (json.dumps(levels, indent=2) if out.suffix == ".json" else text) + "\n")
+    print(json.dumps(levels) if arguments.json else text)
     if out is not None:
         say(f"wrote {out}")

@@ -64,6 +64,7 @@ class DiTConfig:
     time_dim: int = 256
     block_size: int = 1  # latents that see each other both ways: 1 is the paper's text, 3 the released code
     attention: str = "causal"  # or "bidirectional", or "window"
+    path: str = "flow"  # it predicts the velocity, as released; "ddpm": the noise at 1,000 levels, as CMDM Eqs 7-10 say
     text_layers: int = 0  # self-attention among the words of a sentence before latents see them (ours)
     clock: bool = False  # True (ours): each latent knows how far into its sentence it is, and what is left if known
 
@@ -104,6 +105,7 @@ class TrainConfig:
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
     levels: str = "random"  # of the latents: independent (CMDM Alg. 1), or "staircase", as FSS will present them
+    time_power: float = 1.0  # random times are u ** time_power: 1 is the paper's, more draws noisy latents more often
     ema: float = 0.9999
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
     # all
@@ -202,6 +204,7 @@ PRESETS = {
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
+            time_power=1.5,
             ema=0.999,
             weight_decay=0.0,
         ),
@@ -229,6 +232,7 @@ PRESETS = {
             dit_batch=32,
             dit_lr=3e-3,
             dit_warmup=100,
+            time_power=1.5,
             ema=0.995,
             weight_decay=0.0,
         ),

@@ -13,6 +13,7 @@ from minicmdm.diffusion.streaming import LatentStream
 from minicmdm.models.layers import States
 
 FPS, LONGEST = 20, 86_400  # frames per second; a line of a timeline may last a day
+USUAL = 100  # frames: what a sentence asks for takes about as long, unless somebody knows better
 
 
 class MotionStream:
@@ -30,11 +31,13 @@ class MotionStream:
         self._before: np.ndarray | None = None  # (B,1,67) the last frame, which says how the next one moves
         self._yaw, self._place = 0.0, 0.0  # (B,), (B,1,1,3): heading and floor position of that frame
 
-    def prompt(self, prompt: str | list[str | None], at: int | None = None, lasts: int | None = None) -> None:
+    def prompt(self, prompt: str | list[str | None], at: int | None = None, lasts: int | None = USUAL) -> None:
         """Say something new to all streams (or a list, None where nothing changes), now or from frame `at` on.
 
-        `lasts` tells a model that has a clock how many frames it is for. The change falls on the latent, four frames,
-        whose middle it comes before. ValueError: a prompt that cannot be read, or a frame that has already started.
+        `lasts` tells a model that has a clock how many frames it takes; then it is done again, until something else is
+        said. None leaves that open, and no sentence of the training set lasts longer than 9.8 s. The change falls on
+        the latent, four frames, whose middle it comes before. ValueError: a prompt that cannot be read, or a frame that
+        has already started.
         """
         sentences = [prompt] * len(self.latents.generators) if isinstance(prompt, str) else list(prompt)
         if len(sentences) != len(self.latents.generators) or (self.single and not isinstance(prompt, str)):

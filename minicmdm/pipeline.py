@@ -4,7 +4,8 @@
     motion = pipe("a person walks, then waves the left hand", num_frames=120, seed=0)
 
 A motion depends on its own prompt, length and seed, and never on what else is in its batch: each prompt has its own
-generator, and the noise for the longest motion is drawn first and then cut. As the model is causal, a longer motion
+generator, and the noise for the longest motion is drawn first and then cut. (Solvers that draw noise at every step
+draw it for the longest of the batch, so there the company counts.) As the model is causal, a longer motion
 of the same prompt and seed begins like the shorter one, unless the model is told how long it is to be (`tell_length`).
 """
 
@@ -20,10 +21,10 @@ from torch import Tensor
 
 import minicmdm
 from minicmdm.data.features import features_to_joints
-from minicmdm.diffusion.sampling import guided, sample
+from minicmdm.diffusion.sampling import SOLVERS, Denoise, from_noise_prediction, guided, sample
 from minicmdm.diffusion.schedules import schedule_matrix
 from minicmdm.diffusion.streaming import LatentStream
-from minicmdm.live import MotionStream, latents_before
+from minicmdm.live import USUAL, MotionStream, latents_before
 from minicmdm.models.layers import States
 from minicmdm.models.text import Words
 from minicmdm.motion import Motion
@@ -80,6 +81,7 @@ class MotionPipeline:
         num_steps: int = 20,
         uncertainty: int = 2,
         guidance_scale: float = 3.0,
+        solver: str | None = None,
         block_size: int | None = None,
         seed: int | Sequence[int] = 0,
         tell_length: bool = True,
@@ -87,7 +89,8 @@ class MotionPipeline:
         """Generate a Motion for a prompt, or a list of them for a list of prompts.
 
         `num_frames` (4..196 at 20 fps) and `seed` are one for all or one for each. `schedule` is one of
-        `schedules.KINDS`, with K = `num_steps` and L = `uncertainty`; `block_size` is the model's own unless given.
+        `schedules.KINDS`, with K = `num_steps` and L = `uncertainty`; `solver` is one of `sampling.SOLVERS`, by default
+        "euler", or "ddpm" for a model that predicts noise; `block_size` is the model's own unless given.
         With `tell_length` a model that has a clock knows how long the motion is to be, and paces itself; without, a
         longer motion begins exactly like a shorter one.
         Raises ValueError for anything that cannot be asked.
@@ -102,16 +105,23 @@ class MotionPipeline:
         scale = _check_guidance(guidance_scale)
         block_size = self.preset.dit.block_size if block_size is None else _integer(block_size, "block_size", 1, 49)
         schedule_matrix(1, num_steps, uncertainty, block_size, schedule)  # refuse a bad schedule before any work
+        solver = solver or {"flow": "euler", "ddpm": "ddpm"}[self.preset.dit.path]
+        if solver not in SOLVERS:
+            raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}")
 
         motions: dict[int, Motion] = {}
         order = sorted(range(len(prompts)), key=lambda i: frames[i])
         for first in range(0, len(order), TOGETHER):
             chosen = order[first : first + TOGETHER]
             counts = [-(-frames[i] // 4) for i in chosen]  # latents: frames / 4, rounded up
-            noise = torch.stack([self._noise(seeds[i], max(counts)) for i in chosen])  # (B,N,C)
+            luck = [torch.Generator().manual_seed(seeds[i]) for i in chosen]
+            noise = torch.stack([self._noise(generator, max(counts)) for generator in luck])  # (B,N,C)
             valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]  # (B,N)
             matrix = schedule_matrix(max(counts), num_steps, uncertainty, block_size, schedule)
-            features = self._generate([prompts[i] for i in chosen], noise, valid, matrix, scale, tell_length)  # (B,T,D)
+            denoise = self._denoiser([prompts[i] for i in chosen], valid, scale, tell_length)
+            how = dict(solver=solver, path=self.preset.dit.path, generator=luck)  # for a solver that draws more noise
+            latents = sample(denoise, matrix, noise, **how)  # (B,N,C)
+            features = self.decode(latents).numpy()  # (B,T,D)
             for i, one in zip(chosen, features):
                 one = one[: frames[i]].copy()
                 joints = features_to_joints(one).astype(np.float32)  # (T,22,3)
@@ -131,15 +141,20 @@ class MotionPipeline:
         window: int | None = None,
         new_prompt: str = "new",
         num_frames: int | None = None,
-        lasts: int | None = None,
+        lasts: int | None = USUAL,
     ) -> MotionStream:
         """Begin a motion without an end: iterate for frames (22,3), and call `prompt` on it at any time.
 
-        It is what `pipe(prompt, tell_length=False)` gives, as long as its `window` of latents holds. A list of prompts
-        makes as many streams in step, frames (B,22,3). A `new_prompt` is heard by the "new" latents only, or by the
-        "active" ones in flight too. `num_frames` gives the stream an end after all; `lasts` tells how many frames the
-        prompt is for, where that is known. Raises ValueError for anything that cannot be asked.
+        A list of prompts makes as many streams in step, frames (B,22,3). `lasts` says how many frames the prompt takes,
+        and then it is done again, until something else is said; with None nobody knows, and the stream is what
+        `pipe(prompt, tell_length=False)` gives, as long as its `window` of latents holds. A `new_prompt` is heard by
+        the "new" latents only, or by the "active" ones in flight too. `num_frames` gives the stream an end after all.
+        Raises ValueError for anything that cannot be asked.
         """
+        if self.preset.dit.path != "flow":
+            raise ValueError(
+                "this model predicts noise, and the stream steps along a velocity: generate motions instead"
+            )
         single = isinstance(prompt, str)
         prompts = [prompt] if single else _as_list(prompt, "prompt", "a string or a list of strings")
         seeds = [_integer(s, "seed", 0, 2**63 - 1) for s in _spread(seed, len(prompts), "seed")]
@@ -172,10 +187,8 @@ class MotionPipeline:
         return MotionStream(latents, self.decode, single, num_frames)
 
     @torch.no_grad()
-    def _generate(
-        self, prompts: list[str], noise: Tensor, valid: Tensor, matrix: np.ndarray, scale: float, tell_length: bool
-    ) -> np.ndarray:
-        batch, num_latents, _ = noise.shape
+    def _denoiser(self, prompts: list[str], valid: Tensor, scale: float, tell_length: bool) -> Denoise:
+        batch, num_latents = valid.shape
         words = self._read(prompts)  # (B,S,E), (B,S)
         null = self._read([""])  # (1,2,E): what the model saw when its text was dropped
         mask = words.mask[:, None, :].expand(-1, num_latents, -1)  # (B,N,S): every latent sees the whole sentence
@@ -185,8 +198,7 @@ class MotionPipeline:
         left = valid.sum(1, keepdim=True) - 1 - place if tell_length else torch.full_like(place, -1.0)
         clock = torch.stack([place, left], dim=-1)  # (B,N,2): all is one sentence
         denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid, clock)
-        latents = sample(denoise, matrix, noise)  # (B,N,C)
-        return self.decode(latents).numpy()
+        return from_noise_prediction(denoise) if self.preset.dit.path == "ddpm" else denoise
 
     @torch.no_grad()
     def _read(self, sentences: list[str]) -> Words:
@@ -209,8 +221,7 @@ class MotionPipeline:
         whole = len(features) // 4 * 4
         return self.decode(self.encode(features[None, :whole]))[0].numpy()
 
-    def _noise(self, seed: int, num_latents: int) -> Tensor:
-        generator = torch.Generator().manual_seed(seed)
+    def _noise(self, generator: torch.Generator, num_latents: int) -> Tensor:
         longest = -(-MAX_FRAMES // 4)
         return torch.randn(longest, self.preset.dit.latent_dim, generator=generator)[:num_latents]
 

@@ -24,6 +24,13 @@ def test_times_are_uniform_equal_in_a_block_and_independent_between_blocks(block
     assert (together[same_block] > 0.999).all() and (together[~same_block].abs() < 0.08).all()
 
 
+def test_a_power_draws_noisy_latents_more_often():
+    t = draw_times(4000, 7, 1, seeded(), power=2.0)
+    below = torch.tensor([0.04, 0.25, 0.64])
+    share = (t.flatten()[:, None] < below).float().mean(0)
+    assert torch.allclose(share, below.sqrt(), atol=0.02)  # P(u^2 < x) = sqrt(x)
+
+
 def test_a_model_that_knows_the_data_has_no_loss_and_a_silent_one_pays_the_target():
     torch.manual_seed(0)
     z = 2 * torch.randn(64, 16, 4, dtype=torch.float64)

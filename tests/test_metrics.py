@@ -597,7 +597,8 @@ def test_arrows():
     keys = (
         "oracle_accuracy oracle_accuracy_heldout r_at_1 r_at_2 r_at_3 mm_dist fid diversity multimodality clip_score "
     )
-    keys += "skating_ratio mpjpe_mm pa_mpjpe_mm accel_mm pj auj transition_fid transition_distance_cm m2t m2m"
+    keys += "skating_ratio mpjpe_mm pa_mpjpe_mm accel_mm pj auj transition_fid transition_distance_cm m2t m2m "
+    keys += "segments_found"
     assert set(m.ARROWS) == set(keys.split())
 
 

@@ -97,8 +97,10 @@ def dense(model, sentences, matrix, scale, reach="new", says=()):
             for n, (sentence, begin, lasts) in enumerate(owner[b]):
                 k = texts.index(sentence)
                 mask[b, n, k * length : (k + 1) * length] = read_all.mask[k]
-                left = lasts - 1 - (n - begin)
-                clock[b, n] = torch.tensor([n - begin, left if lasts and left >= 0 else -1])
+                since = n - begin
+                while lasts and since >= lasts:  # again and again
+                    since -= lasts
+                clock[b, n] = torch.tensor([since, lasts - 1 - since if lasts else -1])
         null_words, null_mask = (
             NULL.embeddings.to(dtype).expand(batch, -1, -1),
             NULL.mask[:, None].expand(batch, total, -1),

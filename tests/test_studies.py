@@ -1,5 +1,7 @@
 """Studies: rows are measured once, intervals are Student's, and what spoils a motion spoils it in the way it says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,9 @@ import torch
 from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
-from minicmdm.evaluation import studies
+from minicmdm.evaluation import drift, studies
+from minicmdm.evaluation.horizon import act_out, draw
+from minicmdm.evaluation.spoilt import Spoilt
 from minicmdm.motion import Motion
 
 
@@ -38,16 +42,14 @@ def ask(pipe, clips):
 def test_what_is_whole_is_the_pipeline_and_is_asked_once(world):
     clips, pipe = world
     for _ in range(2):
-        found = ask(studies.Spoilt(pipe, "is whole"), clips)
+        found = ask(Spoilt(pipe, "is whole"), clips)
         assert all(np.array_equal(motion.features, clip.features) for motion, clip in zip(found, clips))
     assert pipe.asked == len(clips)
 
 
 def test_each_way_of_spoiling_does_what_it_says(world):
     clips, pipe = world
-    spoilt = {
-        how: ask(studies.Spoilt(pipe, how, 0.5), clips) for how in ("freezes", "trembles", "is mirrored", "is slow")
-    }
+    spoilt = {how: ask(Spoilt(pipe, how, 0.5), clips) for how in ("freezes", "trembles", "is mirrored", "is slow")}
     assert all(np.ptp(m.features, axis=0).max() < 1e-6 for m in spoilt["freezes"])
     for clip, shaken in zip(clips, spoilt["trembles"]):
         apart = (shaken.features - clip.features) / pipe.stats["feature_std"].numpy()
@@ -69,7 +71,7 @@ def test_each_way_of_spoiling_does_what_it_says(world):
 
 def test_hearing_another_answers_another_prompt(world):
     clips, pipe = world
-    found = ask(studies.Spoilt(pipe, "hears another", 1.0), clips)
+    found = ask(Spoilt(pipe, "hears another", 1.0), clips)
     assert not any(np.array_equal(motion.features, clip.features) for motion, clip in zip(found, clips))
     assert sorted(len(m.features) for m in found) == sorted(len(c.features) for c in clips)
 
@@ -100,3 +102,34 @@ def test_intervals_and_correlations_against_hand_computed_ones():
 def test_committed_rows_can_be_told(name):
     rows = studies.read(name)
     assert len(studies.summary(name, rows).splitlines()) > len(rows)
+
+
+def test_a_script_fills_its_minutes_with_prompts_of_five_to_ten_seconds():
+    takes = drift.scripts(1)
+    assert len(takes) == 8 and len({take.prompts[0][1] for take in takes}) > 4
+    for take in takes:
+        lengths = [end - start for start, end in take.spans]
+        assert min(lengths) >= 100 and max(lengths) <= 196
+        assert 1200 <= take.spans[-1][1] < 1200 + 196 and len(take.joints) == take.spans[-1][1] + 1
+
+
+def test_drift_is_seen_where_it_is():
+    """A performer who does as told for a minute, and then stands still for the next."""
+    rng = np.random.default_rng(0)
+    source = [(clip.program[0], clip.labels[0][2]) for clip in toy_dataset("test", 200).clips]
+    take = act_out(draw(source, 1, 48, 4, rng)[0], rng)
+    half = next(start for start, _ in take.spans if start >= 1200)
+    take.joints[half:] = take.joints[half]
+    take = replace(take, prompts=[((segment,), said) for segment, said in take.prompts])
+    row = drift.judged(take, 2, 1)
+    assert row["finite"] == 1 and 0.8 < row["reach_m"] < 1.2
+    assert row["minutes 0-1"] > 0.9 and row["minutes 1-2"] < 0.2
+    take.joints[5, 3] = np.nan
+    assert drift.judged(take, 2, 1)["finite"] == 0
+
+
+def test_a_study_with_seeds_is_told_with_intervals():
+    rows = [{"K": 20, "L": k % 2, "seed": k // 2, "fid": float(k)} for k in range(6)]
+    told = studies.summary("sampling", rows).splitlines()
+    assert told[0].split() == ["K", "L", "fid"] and told[1].split() == ["20", "0", "2", "±", "5"]
+    assert len(told) == 3  # two settings, three seeds each

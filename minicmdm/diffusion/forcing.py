@@ -13,16 +13,19 @@ from minicmdm.diffusion.path import DDPM_LEVELS, cosine_alpha_bar, interpolate, 
 LEVELS = 64  # different times in one batch
 
 
-def draw_times(batch: int, num_latents: int, block_size: int, generator: torch.Generator | None = None) -> Tensor:
-    """Flow times (B,N), uniform on [0,1), one draw per block of latents, on the generator's device.
+def draw_times(
+    batch: int, num_latents: int, block_size: int, generator: torch.Generator | None = None, power: float = 1.0
+) -> Tensor:
+    """Flow times (B,N) = u ** power, u uniform on [0,1), one draw per block of latents, on the generator's device.
 
-    One batch uses LEVELS different times, evenly spaced from a random first one: each draw is uniform on [0,1) all the
-    same, and the denoiser computes its modulation once a level rather than once a latent.
+    A power of 1 is the paper's uniform choice. More draws noisy latents more often: there it is decided what will
+    happen, and near the data only how exactly. One batch uses LEVELS different u, evenly spaced from a random first
+    one: each is uniform all the same, and the denoiser computes its modulation once a level rather than once a latent.
     """
     device = generator.device if generator is not None else None
     num_blocks = -(-num_latents // block_size)
     level = torch.randint(LEVELS, (batch, num_blocks), generator=generator, device=device)  # (B,blocks)
-    t = (level + torch.rand((), generator=generator, device=device)) / LEVELS
+    t = ((level + torch.rand((), generator=generator, device=device)) / LEVELS) ** power
     return t.repeat_interleave(block_size, dim=1)[:, :num_latents]  # (B,N)
 
 

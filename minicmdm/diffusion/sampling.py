@@ -19,7 +19,7 @@ CMDM's Alg. 2, read literally, would also step latents that wait (level K) or ar
 code leaves those alone, and so do we, whatever the solver.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,7 @@ from minicmdm.diffusion.path import (
 from minicmdm.diffusion.schedules import check_matrix
 
 Denoise = Callable[[Tensor, Tensor], Tensor]  # (z_t (B,N,C), t (B,N)) -> velocity (B,N,C)
+Luck = torch.Generator | Sequence[torch.Generator]  # one for the batch, or one for each of its samples
 SOLVERS = ("euler", "heun", "ddpm", "ddim")
 NOISIEST = (
     0.98  # of K, one of 50 steps from pure noise: the noisiest level at which a prediction of noise is turned into data
@@ -67,7 +68,7 @@ def sample_steps(
     solver: str = "euler",
     path: str = "flow",
     eta: float = 0.0,
-    generator: torch.Generator | None = None,
+    generator: Luck | None = None,
 ) -> Iterator[SampleStep]:
     """Yield the state at every row of the matrix (M,N), starting from noise (B,N,C).
 
@@ -77,7 +78,7 @@ def sample_steps(
     A prefix (B,P,C) of finished latents is put in front: it is at level 0 throughout, never moves, and is
     part of every z that is yielded. For a model with blocks, P should be a multiple of the block size.
     solver, path: see the top of the file. eta in [0,1] is read by "ddim" alone, and is 1 for "ddpm". Whoever draws new
-    noise needs the generator.
+    noise needs the generator: one, or one for each sample, so that none depends on the others.
     ValueError: the matrix is not a schedule, its columns are not the noise's latents, an unknown solver or path, an eta
     outside [0,1] or for a solver that has none, or new noise and no generator.
     """
@@ -106,9 +107,7 @@ def sample_steps(
             clean = velocity_to_data(z, v, before)
             if solver == "heun":
                 v = (v + _velocity(denoise, euler_step(z, v, before, after), after, seen)) / 2
-            fresh = None
-            if eta:
-                fresh = torch.randn(z.shape, generator=generator, dtype=z.dtype, device=generator.device).to(z.device)
+            fresh = _fresh_noise(z, generator) if eta else None
             z = ddim_step(z, v, before, after, eta, fresh)  # Euler's, when eta is 0
         yield SampleStep(row, matrix[row], z, after, clean)
 
@@ -118,7 +117,14 @@ def _velocity(denoise: Denoise, z: Tensor, t: Tensor, seen: int) -> Tensor:
     return torch.cat([v, torch.zeros_like(z[:, seen:])], dim=1)  # (B,N,C)
 
 
-def _check_solver(solver: str, eta: float, generator: torch.Generator | None) -> float:
+def _fresh_noise(z: Tensor, generator: Luck) -> Tensor:
+    if isinstance(generator, torch.Generator):
+        return torch.randn(z.shape, generator=generator, dtype=z.dtype, device=generator.device).to(z.device)
+    each = [torch.randn(z.shape[1:], generator=g, dtype=z.dtype, device=g.device) for g in generator]
+    return torch.stack(each).to(z.device)
+
+
+def _check_solver(solver: str, eta: float, generator: Luck | None) -> float:
     if solver not in SOLVERS:
         raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}")
     if not 0 <= eta <= 1:
@@ -141,7 +147,7 @@ def sample(
     solver: str = "euler",
     path: str = "flow",
     eta: float = 0.0,
-    generator: torch.Generator | None = None,
+    generator: Luck | None = None,
 ) -> Tensor:
     """Run the matrix (M,N) to its end: noise (B,N,C) -> clean latents (B,N,C), or (B,P+N,C) with a prefix.
 

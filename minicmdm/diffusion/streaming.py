@@ -57,7 +57,7 @@ class Said:
     start: int  # the first latent that hears it
     sentences: list[str]
     begin: Tensor  # (B,) where each stream's sentence began
-    lasts: Tensor  # (B,) how long it will last, 0 if nobody knows
+    lasts: Tensor  # (B,) how long it lasts, and then again and again; 0 if nobody knows
     words: list[tuple[Tensor, Tensor]]  # every block's keys and values (R,H,S,d); R counts both branches of guidance
     real: Tensor  # (R,S) bool, False on padding
 
@@ -231,7 +231,8 @@ class LatentStream:
                 torch.stack([getattr(s, name) for s in used], dim=1)[:, owner] for name in ("begin", "lasts")
             )
             since = self.first + torch.arange(n, device=which.device) - begin  # (B,n)
-            left = torch.where(lasts > 0, lasts - 1 - since, -1).clamp(min=-1)
+            again = torch.where(lasts > 0, lasts, since + 1)  # when its time is over, a sentence begins again
+            since, left = since % again, torch.where(lasts > 0, lasts - 1 - since % again, -1)
             clock = torch.stack([since, left], dim=-1)  # (B,n,2)
             told = clock_features(self.z[..., 0], clock).to(self.model_dtype).repeat(copies, 1, 1)
         v = self.dit.evaluate(

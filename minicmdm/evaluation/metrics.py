@@ -21,7 +21,8 @@ from minicmdm.data.skeleton import FPS, NUM_JOINTS
 # Which way is better, as papers print it; "→" is nearer to the ground truth. (A frozen body has the least skating.)
 _UP = "oracle_accuracy oracle_accuracy_heldout r_at_1 r_at_2 r_at_3 multimodality clip_score m2t m2m"
 _DOWN = "mm_dist fid skating_ratio mpjpe_mm pa_mpjpe_mm accel_mm auj transition_fid transition_distance_cm"
-ARROWS = dict.fromkeys(_UP.split(), "↑") | dict.fromkeys(_DOWN.split(), "↓") | {"diversity": "→", "pj": "→"}
+_NEAR = "diversity pj segments_found"
+ARROWS = dict.fromkeys(_UP.split(), "↑") | dict.fromkeys(_DOWN.split(), "↓") | dict.fromkeys(_NEAR.split(), "→")
 
 FEET = (10, 11)  # left, right
 CONTACT_HEIGHT, SKATING_SPEED, SKATING_WINDOW = 0.05, 0.5, 5  # m, m/s (a comment in the release says 0.2), steps

@@ -32,6 +32,7 @@ from minicmdm.pipeline import MotionPipeline
 
 Bench = Mapping[str, Evaluator]
 PROTOCOLS = ("t2m", "recon")
+HORIZONS = {"long": (16, 8), "mtt": (64, 3)}  # compositions, prompts in each; full size is (64, 32) and (500, 3)
 JUDGE = "t2m_essential"
 POOL = 32  # how many motions a text is to find its own among
 TEXTS, SAMPLES = 32, 10  # of MultiModality
@@ -48,18 +49,21 @@ def evaluate(
     evaluator: str = JUDGE,
     repeats: int = 5,
     limit: int | None = None,
+    compositions: int | None = None,
+    prompts_each: int | None = None,
     progress: bool = True,
     **sampling: str | int | float,
 ) -> dict:
-    """Run a protocol, "t2m" or "recon", or both when none is named, and merge what they measure into one result.
+    """Run a protocol, "t2m", "recon", "long" or "mtt", or the first two when none is named, merged into one result.
 
     `bench` holds the judges (default: the shipped ones), `checkpoint` is the name that the result carries, `sampling`
-    goes to `text_to_motion` (schedule, num_steps, uncertainty, guidance_scale). ValueError for what cannot be asked.
+    goes to `text_to_motion` (schedule, num_steps, uncertainty, guidance_scale) or, with `compositions` and
+    `prompts_each`, to `horizon.timelines`. ValueError for what cannot be asked.
     """
     start = time.perf_counter()
-    check(protocol, evaluator, repeats, limit)
+    check(protocol, evaluator, repeats, limit, compositions, prompts_each)
     wanted = PROTOCOLS if protocol is None else (protocol,)
-    if sampling and "t2m" not in wanted:
+    if sampling and wanted == ("recon",):
         raise ValueError(f"reconstruction samples nothing, so {', '.join(sampling)} has no meaning there")
     bench, common = bench or load_bench(), {"evaluator": evaluator, "limit": limit, "progress": progress}
     parts = []
@@ -67,15 +71,36 @@ def evaluate(
         parts.append(text_to_motion(pipe, bench, repeats=repeats, **common, **sampling))
     if "recon" in wanted:
         parts.append(reconstruction(pipe, bench, **common))
+    if protocol in HORIZONS:
+        from minicmdm.evaluation.horizon import timelines  # which is made of what is here
+
+        sizes = {"compositions": compositions, "prompts_each": prompts_each}
+        parts.append(timelines(pipe, bench, protocol, repeats=repeats, **sizes, **common, **sampling))
     own = {"protocol": "+".join(wanted), "checkpoint": checkpoint, "seconds": round(time.perf_counter() - start, 1)}
     own["metrics"] = {key: value for part in parts for key, value in part["metrics"].items()}
     return {**parts[0], **own}  # where both have a word, as for repeats, it is text-to-motion's
 
 
-def check(protocol: str | None = None, evaluator: str = JUDGE, repeats: int = 1, limit: int | None = None) -> None:
-    """Raise ValueError for a protocol, judge, number of repeats or of clips that `evaluate` could not work with."""
-    if protocol not in (None, *PROTOCOLS):
-        raise ValueError(f"unknown protocol {protocol!r}: expected {' or '.join(PROTOCOLS)}, or none for both")
+def check(
+    protocol: str | None = None,
+    evaluator: str = JUDGE,
+    repeats: int = 1,
+    limit: int | None = None,
+    compositions: int | None = None,
+    prompts_each: int | None = None,
+) -> None:
+    """Raise ValueError for a protocol, judge, number of repeats or size that `evaluate` could not work with."""
+    if protocol not in (None, *PROTOCOLS, *HORIZONS):
+        named = f"{' or '.join(PROTOCOLS)}, {' or '.join(HORIZONS)}, or none for the first two"
+        raise ValueError(f"unknown protocol {protocol!r}: expected {named}")
+    if protocol in HORIZONS:
+        sizes = zip((compositions, prompts_each), HORIZONS[protocol])
+        many, each = (usual if own is None else own for own, usual in sizes)
+        if many < 1 or each < 2 or many * each < POOL:
+            least = f"compositions of at least 2 prompts, and {POOL} prompts in all, one pool of R-precision"
+            raise ValueError(f"the protocol {protocol} needs {least}, and {many} of {each} came")
+    elif (compositions, prompts_each) != (None, None):
+        raise ValueError(f"compositions and their prompts are for the protocols {' and '.join(HORIZONS)} alone")
     if evaluator not in ("t2m", "t2m_essential"):
         raise ValueError(f"unknown evaluator {evaluator!r}: expected t2m (263 features) or t2m_essential (67)")
     if repeats < 1:

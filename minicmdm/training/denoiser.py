@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
-from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase
+from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase, draw_times
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder, WordCache
 from minicmdm.training import checkpoints
@@ -67,14 +67,16 @@ def denoising_loss(
 ) -> Tensor:
     """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent."""
     batch = draw_batch(latents, count, drop, generator)
-    t, committed, visible, block_size = None, None, batch.valid, plan.dit.block_size
+    block_size, committed, visible = plan.dit.block_size, None, batch.valid
     if plan.train.levels == "staircase":
         t, committed, visible = draw_staircase(batch.valid, block_size, generator)
-    elif plan.dit.attention == "window":
-        committed, visible = draw_boundary(batch.valid, block_size, generator)
+    else:
+        t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
+        if plan.dit.attention == "window":
+            committed, visible = draw_boundary(batch.valid, block_size, generator)
     with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
         read = dit.read(words.encode(batch.sentences))  # each different sentence once: (U,S1,E), (U,S1)
         seen, mask = words_per_latent(read, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
         return diffusion_forcing_loss(
-            dit, batch.z, seen, mask, visible, block_size, generator, batch.clock, committed=committed, t=t
+            dit, batch.z, seen, mask, visible, block_size, generator, batch.clock, plan.dit.path, committed, t
         )
