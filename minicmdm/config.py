@@ -200,11 +200,10 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=7_500,
+            dit_steps=6_500,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
-            time_power=1.5,
             ema=0.999,
             weight_decay=0.0,
         ),
@@ -232,7 +231,7 @@ PRESETS = {
             dit_batch=32,
             dit_lr=3e-3,
             dit_warmup=100,
-            time_power=1.5,
+            time_power=1.5,  # in so short a run it gained 4 and 9 points of accuracy (one seed each)
             ema=0.995,
             weight_decay=0.0,
         ),

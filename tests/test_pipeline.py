@@ -218,3 +218,23 @@ def test_shipped_checkpoint_walks():
     assert json.loads((folder / "card.json").read_text(encoding="utf-8"))["fast"] is False
     motion = MotionPipeline.from_pretrained("toy")("a person walks forward", 80)
     assert np.linalg.norm(motion.joints[-1, 0, [0, 2]]) > 0.5
+
+
+@pytest.mark.parametrize("how", [{}, {"schedule": "autoregressive"}, {"schedule": "full"}, {"tell_length": False}])
+def test_the_cached_way_gives_what_the_dense_one_gives(pipe, how):
+    """DDIM with eta = 0 is Euler's step, and only Euler has the stream."""
+    prompts, frames = ["a person walks", "a person jumps twice", "he sits down"], [33, 60, 47]
+    fast = pipe(prompts, frames, num_steps=4, seed=[1, 2, 3], **how)
+    slow = pipe(prompts, frames, num_steps=4, seed=[1, 2, 3], solver="ddim", **how)
+    for one, other in zip(fast, slow):
+        assert one.features.shape == other.features.shape
+        np.testing.assert_allclose(one.features, other.features, atol=2e-4)
+
+
+def test_solvers_differ_and_unknown_ones_are_refused(pipe):
+    euler, heun, ddpm = (pipe("a person walks", 40, num_steps=4, solver=name) for name in ("euler", "heun", "ddpm"))
+    assert np.abs(euler.features - heun.features).max() > 1e-5 < np.abs(euler.features - ddpm.features).max()
+    again = pipe("a person walks", 40, num_steps=4, solver="ddpm")
+    assert np.array_equal(ddpm.features, again.features)  # its new noise comes from the seed, too
+    with pytest.raises(ValueError, match="unknown solver 'leapfrog'"):
+        pipe("a person walks", solver="leapfrog")

@@ -23,7 +23,7 @@ def noise(batch, latents, channels, seed=0):
 
 
 def text(batch, latents, words, seed=1):
-    return noise(batch, words, 5, seed), torch.ones(batch, latents, words, dtype=torch.bool)
+    return noise(batch, words, 16, seed), torch.ones(batch, latents, words, dtype=torch.bool)
 
 
 # --- Gaussians: the best possible velocity is known, so the right answer is too -------------------------------------

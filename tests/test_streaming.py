@@ -31,7 +31,7 @@ TINY = DiTConfig(latent_dim=3, text_dim=5, dim=16, layers=2, heads=2, time_dim=8
 def read(sentences):
     """A text encoder of sorts: as many words as the sentence has letters, the same ones for the same letters."""
     words = [
-        torch.randn(len(s), 5, generator=torch.Generator().manual_seed(sum(map(ord, s)))).double() for s in sentences
+        torch.randn(len(s), 16, generator=torch.Generator().manual_seed(sum(map(ord, s)))).double() for s in sentences
     ]
     longest = max(map(len, sentences))
     mask = torch.tensor([[place < len(s) for place in range(longest)] for s in sentences])

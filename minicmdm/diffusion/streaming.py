@@ -19,7 +19,7 @@ The release has no stream: it generates segments, each from scratch on the last 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,7 +86,7 @@ class LatentStream:
         window: int | None = None,
         new_prompt: str = "new",
         num_latents: int | None = None,
-        lasts: int = 0,
+        lasts: int | Sequence[int] = 0,
     ):
         self.pace = calls, blocks = pace(schedule, num_steps, uncertainty)
         if calls == 0 and num_latents is None:
@@ -124,7 +124,7 @@ class LatentStream:
         with torch.no_grad():
             self.modulations = dit.modulations(self.times)  # per block (K+1,6*dim)
             self.said = [
-                Said(0, sentences, nothing, nothing + lasts, *self._read(sentences))
+                Said(0, sentences, nothing, nothing + torch.as_tensor(lasts), *self._read(sentences))
             ]  # now, and what is to come
 
     @property
@@ -182,6 +182,13 @@ class LatentStream:
             self.cache.keep(final)
             self._forget(final)
         return done
+
+    def drain(self) -> Tensor:
+        """Step to the end, which must be known: all latents from the first one on (B,N,C)."""
+        done = []
+        while self.finished < self.num_latents:
+            done.append(self.step())
+        return torch.cat(done, dim=1)
 
     def _start(self) -> None:
         """Let in the latents that this call moves for the first time, and make room for them."""

@@ -100,7 +100,7 @@ def as_released(dit: CausalDiT, words: Tensor, num_steps: int, z: Tensor, levels
 def lean(dit: CausalDiT, words: Tensor, num_steps: int) -> Callable:
     """The same, but the modulation of the K+1 levels and the keys and values of the words are computed here, once."""
     tables = dit.modulations(level_to_time(torch.arange(num_steps + 1).to(words.dtype), num_steps))
-    text = dit.keys_values(words)
+    text = dit.keys_values(dit.embed_words(words))
     return lambda z, levels, mask: dit.evaluate(z, levels, tables, text, None, mask, torch.arange(z.shape[1]), None)
 
 
@@ -111,11 +111,12 @@ def samplers(dit: CausalDiT, sizes: Sizes) -> dict[str, Callable[[], Iterator[Te
     noise = torch.randn(LONGEST, dit.cfg.latent_dim, generator=seed(0))[None, :n]
     words = torch.randn(2, WORDS, dit.cfg.text_dim, generator=seed(1))
     words[1] = 0  # the release's null text
-    text, null = (Words(one[None], torch.ones(1, WORDS, dtype=torch.bool)) for one in words)
+    known = torch.ones(1, WORDS, dtype=torch.bool)
     how = dict(num_steps=steps, uncertainty=UNCERTAINTY, block_size=block_size, guidance_scale=GUIDANCE, num_latents=n)
     half, matrix = copy.deepcopy(dit).to(torch.bfloat16), schedule_matrix(n, steps, UNCERTAINTY, block_size)
 
     def stream(model: CausalDiT, schedule: str) -> Iterator[Tensor]:
+        text, null = (model.read(Words(one[None].to(model.out.weight), known)) for one in words)
         one = LatentStream(model, lambda _: text, null, ["a person"], [seed(0)], schedule=schedule, **how)
         while one.finished < n:
             yield one.step()

@@ -38,8 +38,7 @@ from minicmdm.evaluation.protocols import HORIZONS, JUDGE, POOL, Bench, _entry, 
 from minicmdm.pipeline import MotionPipeline
 
 TEXTS = 60  # of which the timelines of "mtt" are made; a repeat draws them
-# Frames around a seam. FlowMDM takes 3 s for HumanML3D and 1 s for BABEL, whose segments are short. So are ours, from
-# 1.1 s: a window of more than 2 s could hold two seams.
+# Frames around a seam. FlowMDM has 3 s for HumanML3D and 1 s for BABEL; of ours, some segments last 1.1 s alone.
 WINDOW = 30
 TOGETHER = 16  # streams in step
 Prompt = tuple[Segment, str]  # what is asked for, and the sentence that says it
@@ -112,10 +111,7 @@ def timelines(
 
 
 def draw(source: Sequence[Prompt], count: int, each: int, apart: int, rng: Generator) -> list[list[Prompt]]:
-    """`count` compositions of `each` prompts that can be told apart: neighbours, and all in each pool of `apart`.
-
-    ValueError if the source is too poor for that.
-    """
+    """`count` compositions of `each` prompts, all different in each pool of `apart`. ValueError for a poor source."""
     drawn: list[Prompt] = []
     for _ in range(200 * count * each):
         segment, said = source[rng.integers(len(source))]

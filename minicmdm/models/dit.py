@@ -114,7 +114,7 @@ class Block(nn.Module):
 
 
 class WordBlock(nn.Module):
-    """Words look at the words of their own sentence: who turns, to which side, how often. (B,S,E) -> (B,S,E).
+    """Words look at the words of their own sentence: who turns, to which side, how often. (U,S,dim) -> (U,S,dim).
 
     A text encoder learnt by contrast and then frozen need only say which sentence is whose, and hardly tells which word
     goes with which; the denoiser has to know. The paper reads a frozen DistilBERT's words as they are.
@@ -144,7 +144,7 @@ class CausalDiT(nn.Module):
         self.cfg = cfg
         self.embed_latent = nn.Linear(cfg.latent_dim, cfg.dim)
         self.embed_words = nn.Linear(cfg.text_dim, cfg.dim)
-        self.word_blocks = nn.ModuleList(WordBlock(cfg.text_dim, cfg.heads) for _ in range(cfg.text_layers))
+        self.word_blocks = nn.ModuleList(WordBlock(cfg.dim, cfg.heads) for _ in range(cfg.text_layers))
         if cfg.clock:
             self.embed_clock = nn.Linear(2 * CLOCK_DIM + 1, cfg.dim)
         # AdaLN is SiLU and linear in every block; the SiLU is the same for all of them, so it is done here, once.
@@ -168,7 +168,7 @@ class CausalDiT(nn.Module):
     ) -> Tensor:
         """Predict the velocity of every latent.
 
-        z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,E) that `read` has seen, with word_mask (B,N,S), True where
+        z_t (B,N,C) at times t (B,N) in [0,1]; words (B,S,dim) from `read`, with word_mask (B,N,S), True where
         latent n may see word s (a row without any True sees no words at all); valid (B,N), False on padding; clock
         (B,N,2), see `clock_features`, read only by a model that has one; committed (B,N), the finished past under the
         "window" mask, by default those at t = 1. -> (B,N,C).
@@ -195,18 +195,17 @@ class CausalDiT(nn.Module):
         return [block.modulation(time) for block in self.blocks]
 
     def read(self, words: Words) -> Words:
-        """Sentences (U,S,E) as a text encoder leaves them -> as `forward` wants them: their words have met each other.
+        """Sentences (U,S,E) as a text encoder leaves them -> (U,S,dim) as `forward` wants them, each read by itself.
 
         It depends on the sentence alone, so it is done once for each, before sentences are laid side by side.
         """
-        x, mask = words
+        x = self.embed_words(words.embeddings)  # (U,S,E) -> (U,S,dim)
         for block in self.word_blocks:
-            x = block(x, mask[:, None, :], torch.arange(x.shape[1], device=x.device))
-        return Words(x, mask)
+            x = block(x, words.mask[:, None, :], torch.arange(x.shape[1], device=x.device))
+        return Words(x, words.mask)
 
     def keys_values(self, words: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """The keys and values that every block's cross-attention makes of words (B,S,E): (B,H,S,d) each."""
-        words = self.embed_words(words)  # (B,S,E) -> (B,S,dim)
+        """The keys and values that every block's cross-attention makes of read words (B,S,dim): (B,H,S,d) each."""
         return [block.cross_attention.keys_values(words) for block in self.blocks]
 
     def evaluate(
@@ -242,7 +241,7 @@ class CausalDiT(nn.Module):
         expected = {
             "z_t": (z_t, (batch, num_latents, self.cfg.latent_dim)),
             "t": (t, (batch, num_latents)),
-            "words": (words, (batch, words.shape[1], self.cfg.text_dim)),
+            "words": (words, (batch, words.shape[1], self.cfg.dim)),
             "word_mask": (word_mask, (batch, num_latents, words.shape[1])),
             "valid": (valid, (batch, num_latents)),
             "clock": (clock, (batch, num_latents, 2)),
