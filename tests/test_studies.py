@@ -106,7 +106,7 @@ def test_committed_rows_can_be_told(name):
 
 def test_a_script_fills_its_minutes_with_prompts_of_five_to_ten_seconds():
     takes = drift.scripts(1)
-    assert len(takes) == 8 and len({take.prompts[0][1] for take in takes}) > 4
+    assert len(takes) == drift.STREAMS and len({take.prompts[0][1] for take in takes}) > 4
     for take in takes:
         lengths = [end - start for start, end in take.spans]
         assert min(lengths) >= 100 and max(lengths) <= 196
@@ -122,8 +122,10 @@ def test_drift_is_seen_where_it_is():
     take.joints[half:] = take.joints[half]
     take = replace(take, prompts=[((segment,), said) for segment, said in take.prompts])
     row = drift.judged(take, 2, 1)
-    assert row["finite"] == 1 and 0.8 < row["reach_m"] < 1.2
+    assert row["finite"] == 1 and 0.8 < row["reach_m"] < 1.2 and row["frames_beyond"] == 0
     assert row["minutes 0-1"] > 0.9 and row["minutes 1-2"] < 0.2
+    take.joints[7, 20, 0] += 2.0
+    assert drift.judged(take, 2, 1)["frames_beyond"] == 1 / len(take.joints)
     take.joints[5, 3] = np.nan
     assert drift.judged(take, 2, 1)["finite"] == 0
 

@@ -1,11 +1,15 @@
-"""An hour without an end: does a stream still do what it is told after fifty minutes?
+"""Two studies of streams: do they still do what they are told after fifty minutes, and how soon?
 
-Eight streams in step are told a new test caption every 5 to 10 seconds, each as long as its own clip was. What stands
-in a stream's memory is all its own work, and errors might add up; CMDM names that as an open limitation. Measured: no
-number is lost, no joint is further from the pelvis than a skeleton reaches, and the oracle's accuracy in every ten
-minutes, of which the first and the last are compared.
+"drift": sixteen streams in step are told a new test caption every 5 to 10 seconds, each as long as its own clip was.
+What stands in a stream's memory is all its own work, and errors might add up; CMDM names that as an open limitation.
+Measured: whether every number is finite, how often a joint is further from the pelvis than bones reach, and the
+oracle's accuracy in every ten minutes, of which the first and the last are compared.
 
-`python -m minicmdm.evaluation.studies drift` runs it.
+"reaction": a prompt comes while another is acted out, announced by nobody. Latents in flight have begun under the old
+one: they may finish as they are ("new"), or hear the new one as well ("active"). Measured: how many frames pass before
+the first that has heard it, and how often the oracle then finds what was asked.
+
+`python -m minicmdm.evaluation.studies drift` and `... reaction` run them.
 """
 
 from __future__ import annotations
@@ -19,13 +23,17 @@ from pathlib import Path
 import numpy as np
 
 from minicmdm.data.dataset import toy_dataset
-from minicmdm.data.skeleton import FPS
+from minicmdm.data.oracle import read_motion
+from minicmdm.data.skeleton import BONE_LENGTHS, FPS, PARENTS
 from minicmdm.evaluation import metrics
-from minicmdm.evaluation.horizon import Take, answers, follow_all
+from minicmdm.evaluation.horizon import Take, answers, draw, follow_all
 from minicmdm.pipeline import MotionPipeline
 
-STREAMS, MINUTES, BLOCK = 8, 60, 10
+STREAMS, MINUTES, BLOCK = 16, 60, 10
 SHORTEST = 5 * FPS  # frames of a prompt; the longest clip has 9.8 s
+REACH = np.zeros(len(PARENTS))  # from the pelvis to each joint along the bones
+for _joint, _parent in enumerate(PARENTS[1:], start=1):
+    REACH[_joint] = REACH[_parent] + BONE_LENGTHS[_joint]
 HOW = {"schedule": "fss", "num_steps": 20, "uncertainty": 2, "guidance_scale": 3.0}
 
 
@@ -51,9 +59,10 @@ def played(minutes: int) -> list[Take]:
 
 
 def judged(take: Take, minutes: int, block: int) -> dict[str, float]:
-    """One stream's numbers: its farthest reach, and its accuracy in each `block` minutes, by where a prompt begins."""
-    reach = np.linalg.norm(take.joints - take.joints[:, :1], axis=-1).max()
-    row = {"finite": float(np.isfinite(take.joints).all()), "reach_m": float(reach)}
+    """One stream's numbers: how far its joints are, and its accuracy in each `block` minutes, by where a prompt begins."""
+    far = np.linalg.norm(take.joints - take.joints[:, :1], axis=-1)  # (T,22)
+    row = {"finite": float(np.isfinite(take.joints).all()), "reach_m": float(far.max())}
+    row["frames_beyond"] = float((far > 1.02 * REACH).any(1).mean())  # with any joint further than its bones in line
     found = answers(replace(take, joints=np.nan_to_num(take.joints)))  # the oracle refuses what is no number
     begins = np.array([start for start, _ in take.spans])
     for first in range(0, minutes, block):
@@ -71,3 +80,28 @@ def drift_rows(scratch: Path) -> Iterator[tuple[dict, Callable[[], dict]]]:
 
 def _row(number: int) -> dict[str, float]:
     return judged(played(MINUTES)[number], MINUTES, BLOCK)
+
+
+def reaction_rows(scratch: Path) -> Iterator[tuple[dict, Callable[[], dict]]]:
+    """One row for each stagger L and each way in which a new prompt reaches latents in flight."""
+    for wait in (1, 2, 4, 5, 10, 20):
+        for reach in ("new", "active"):
+            yield {"L": wait, "new_prompt": reach}, partial(reaction, wait, reach)
+
+
+def reaction(
+    uncertainty: int, new_prompt: str, pairs: int = 128, before: int = 61, after: int = 80
+) -> dict[str, float]:
+    """Streams are told the first prompt of a pair, and after `before` frames the second, for `after` frames."""
+    clips = toy_dataset("test", progress=False).clips
+    source = [(segment, said) for clip in clips for segment, (_, _, said) in zip(clip.program, clip.labels)]
+    asked = draw(source, pairs, 2, 2, np.random.default_rng(0))
+    how = HOW | {"uncertainty": uncertainty, "new_prompt": new_prompt}
+    stream = MotionPipeline.from_pretrained("toy").stream([a for (_, a), _ in asked], seed=list(range(pairs)), **how)
+    frames = [next(stream) for _ in range(before)]
+    wait = stream.reaction
+    stream.prompt([b for _, (_, b) in asked], lasts=after)
+    joints = np.stack(frames + [next(stream) for _ in range(wait + after)], axis=1)  # (pairs,T,22,3)
+    heard = [tuple(s for s in read_motion(one) if (s.start + s.end) / 2 >= before + wait) for one in joints]
+    right = metrics.segment_accuracy([(segment,) for _, (segment, _) in asked], heard)
+    return {"reaction_frames": float(wait), "oracle_accuracy": right}

@@ -118,6 +118,7 @@ def text_to_motion(
     num_steps: int = 20,
     uncertainty: int = 2,
     guidance_scale: float = 3.0,
+    solver: str | None = None,
     repeats: int = 5,
     limit: int | None = None,
     progress: bool = True,
@@ -130,6 +131,7 @@ def text_to_motion(
     """
     check("t2m", evaluator, repeats, limit)
     ask = dict(schedule=schedule, num_steps=num_steps, uncertainty=uncertainty, guidance_scale=guidance_scale)
+    ask |= {} if solver is None else {"solver": solver}
     pipe(["a person stands"], [4], seed=[0], **ask)  # what the pipeline refuses, it refuses here and not in a minute
     clips = toy_dataset("test", limit, progress).clips
     judges = [bench[evaluator], bench["clip_essential"]]

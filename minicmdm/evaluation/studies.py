@@ -2,7 +2,7 @@
 
     python -m minicmdm.evaluation.studies vae|masks|objective|sampling       small models with seeds (small.py)
     python -m minicmdm.evaluation.studies agreement|hearing|dimensions       what the judges hear (spoilt.py)
-    python -m minicmdm.evaluation.studies drift                              an hour without an end (drift.py)
+    python -m minicmdm.evaluation.studies drift|reaction                     streams, an hour long (drift.py)
 
 Each row is written as soon as it is measured, and rows that are there already are not measured again: a study that was
 stopped goes on. The CSVs of the project are in minicmdm/assets/studies, and `--print` shows what they say.
@@ -31,6 +31,7 @@ ROWS = {
     "hearing": spoilt.hearing_rows,
     "dimensions": spoilt.dimension_rows,
     "drift": drift.drift_rows,
+    "reaction": drift.reaction_rows,
 }
 
 
