@@ -1,6 +1,7 @@
 """Studies: rows are measured once, intervals are Student's, and what spoils a motion spoils it in the way it says."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
-from minicmdm.evaluation import drift, studies
+from minicmdm.evaluation import drift, small, studies
 from minicmdm.evaluation.horizon import act_out, draw
 from minicmdm.evaluation.spoilt import Spoilt
 from minicmdm.motion import Motion
@@ -135,3 +136,32 @@ def test_a_study_with_seeds_is_told_with_intervals():
     told = studies.summary("sampling", rows).splitlines()
     assert told[0].split() == ["K", "L", "fid"] and told[1].split() == ["20", "0", "2", "±", "5"]
     assert len(told) == 3  # two settings, three seeds each
+
+
+def test_small_models_of_one_name_are_one_model(tmp_path, monkeypatch):
+    """A model is trained once and found again by its name, so two plans must never share one."""
+    made, asked = {}, []
+
+    def micro(scratch, name, plan, seed, vae_from=None):
+        assert made.setdefault((name, seed), (plan, vae_from)) == (plan, vae_from)
+
+    seams = {"transition_fid": {"mean": 0.0}, "auj": {"mean": 0.0}}
+    monkeypatch.setattr(small, "micro", micro)
+    monkeypatch.setattr(small, "answers", lambda pipe, **ask: asked.append(ask) or {})
+    monkeypatch.setattr(small, "reconstruction", lambda *_, **__: {"metrics": {"mpjpe_mm": {"mean": 0.0}}})
+    monkeypatch.setattr(small, "timelines", lambda *_, **__: {"metrics": seams})
+    for rows in (small.vae_rows, small.mask_rows, small.objective_rows, small.sampling_rows):
+        labels = []
+        for label, measure in rows(tmp_path):
+            labels.append(tuple(label.values()))
+            measure()
+        assert len(set(labels)) == len(labels) and len(labels) % 3 == 0  # three seeds of each
+    plans = [plan for (_, seed), (plan, _) in made.items() if seed == 0]
+    assert len(plans) == 3 + 4 + 1 and all(a != b for a, b in combinations(plans, 2))  # flow is causal-random again
+    assert {ask.get("solver") for ask in asked} == {None, "euler", "ddpm", "ddim"}
+
+
+def test_a_prompt_that_latents_in_flight_hear_comes_sooner():
+    rows = [drift.reaction(10, reach, pairs=2, before=9, after=12) for reach in ("new", "active")]
+    assert rows[1]["reaction_frames"] == 3 < rows[0]["reaction_frames"] <= 3 + 4 * 2  # 3 are left of a latent
+    assert all(0 <= row["oracle_accuracy"] <= 1 for row in rows)

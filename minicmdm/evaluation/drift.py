@@ -59,7 +59,7 @@ def played(minutes: int) -> list[Take]:
 
 
 def judged(take: Take, minutes: int, block: int) -> dict[str, float]:
-    """One stream's numbers: how far its joints are, and its accuracy in each `block` minutes, by where a prompt begins."""
+    """One stream's numbers: how far joints are, and its accuracy in each `block` minutes, by where a prompt begins."""
     far = np.linalg.norm(take.joints - take.joints[:, :1], axis=-1)  # (T,22)
     row = {"finite": float(np.isfinite(take.joints).all()), "reach_m": float(far.max())}
     row["frames_beyond"] = float((far > 1.02 * REACH).any(1).mean())  # with any joint further than its bones in line
