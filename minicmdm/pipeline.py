@@ -127,7 +127,7 @@ class MotionPipeline:
                 matrix = schedule_matrix(max(counts), num_steps, uncertainty, block_size, schedule)
                 denoise = self._denoiser(asked, valid, scale, tell_length)
                 latents = sample(denoise, matrix, noise, solver=solver, path=self.preset.dit.path, generator=luck)
-            for i, count, one in zip(chosen, counts, latents):  # one by one, as a VAE may look ahead, but not too far
+            for i, count, one in zip(chosen, counts, latents):  # a VAE that looks ahead must not see padding
                 features = self.decode(one[None, :count])[0, : frames[i]].numpy()  # (T,D)
                 motions[i] = Motion(features_to_joints(features).astype(np.float32), features, prompts[i])
         return motions[0] if single else [motions[i] for i in range(len(prompts))]

@@ -121,11 +121,11 @@ class LatentStream:
         self.first = self.finished = 0  # the first latent in z, and how many latents are finished
         self.heard: list[Said] = []  # what each latent in z is told
         nothing = torch.zeros(len(generators), dtype=torch.long, device=weight.device)
+        lengths = nothing + torch.as_tensor(lasts, device=weight.device)  # (B,)
         with torch.no_grad():
             self.modulations = dit.modulations(self.times)  # per block (K+1,6*dim)
-            self.said = [
-                Said(0, sentences, nothing, nothing + torch.as_tensor(lasts), *self._read(sentences))
-            ]  # now, and what is to come
+            # now, and what is to come
+            self.said = [Said(0, sentences, nothing, lengths, *self._read(sentences))]
 
     @property
     def started(self) -> int:

@@ -78,5 +78,14 @@ def denoising_loss(
         read = dit.read(words.encode(batch.sentences))  # each different sentence once: (U,S1,E), (U,S1)
         seen, mask = words_per_latent(read, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
         return diffusion_forcing_loss(
-            dit, batch.z, seen, mask, visible, block_size, generator, batch.clock, plan.dit.path, committed, t
+            dit,
+            batch.z,
+            seen,
+            mask,
+            visible,
+            generator=generator,
+            clock=batch.clock,
+            path=plan.dit.path,
+            committed=committed,
+            t=t,
         )

@@ -50,7 +50,7 @@ def train(
     """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
-    `compile` makes the denoiser's steps about a quarter shorter, where there is a C++ compiler.
+    `compile` makes the denoiser's steps shorter, where there is a C++ compiler.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """
     plan = preset(preset_name) if isinstance(preset_name, str) else preset_name
