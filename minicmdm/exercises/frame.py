@@ -1,4 +1,4 @@
-"""The notebooks' exercises: check an answer, ask for a hint, read the solution; and two helpers for training in them.
+"""The frame of the exercises: check an answer, ask for a hint, read the solution; and two helpers for training.
 
     check("00.1", my_shapes)     not attempted: prints the hint · wrong: AssertionError · right: a short line
     hint("00.1")                 the hint alone
@@ -19,10 +19,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-
-from minicmdm.config import VAEConfig
-from minicmdm.models.vae import MACVAE
 
 
 @dataclass(frozen=True)
@@ -115,6 +111,8 @@ def _fast() -> bool:
 
 
 def _find(id: str) -> Exercise:
+    from minicmdm.exercises import EXERCISES  # here, as the exercises themselves stand on this frame
+
     if id not in EXERCISES:
         raise ValueError(f"there is no exercise {id!r}: expected one of {', '.join(EXERCISES)}")
     return EXERCISES[id]
@@ -134,71 +132,7 @@ def _brief(value: object) -> str:
     return text if len(text) <= 200 else text[:197] + "..."
 
 
-def _sizes(low: int, high: int, count: int = 12) -> list[int]:
+def sizes(low: int, high: int, count: int = 12) -> list[int]:
     """The smallest sizes, one by one, and then random larger ones in order."""
     rng = np.random.default_rng(0)
     return [*range(low, low + 6), *sorted(rng.integers(low + 6, high + 1, size=count).tolist())]
-
-
-# --- 00 start_here ----------------------------------------------------------------------------------------------------
-
-
-def motion_shapes(num_frames: int, latent_dim: int) -> tuple[tuple, tuple, tuple]:
-    """Shapes of one motion of T frames: latents (N,C), decoded features (4N,263), joints (T,22,3)."""
-    num_latents = -(-num_frames // 4)  # rounded up: the last latent may stand for frames that nobody asked for
-    return (num_latents, latent_dim), (4 * num_latents, 263), (num_frames, 22, 3)
-
-
-def _prove_shapes(answer: Callable) -> None:
-    for frames in _sizes(4, 196):
-        width = 8 + frames % 3 * 4
-        latents, features, joints = (tuple(shape) for shape in answer(frames, width))
-        must(len(latents) == 2 and latents[1] == width, f"A latent has {width} channels: the shape is (N, {width}).")
-        must(4 * latents[0] >= frames, f"{latents[0]} latents draw {4 * latents[0]} frames, fewer than {frames}.")
-        must(4 * latents[0] < frames + 4, f"One latent fewer would still draw all {frames} frames.")
-        must(features == (4 * latents[0], 263), "The decoder draws four frames of 263 features for every latent.")
-        must(joints == (frames, 22, 3), "You get as many frames as you asked for, each of 22 joints in space.")
-
-
-def first_frame_moved(frame: int) -> int:
-    """The first frame of the VAE's output that can move when this frame of its input does."""
-    return frame // 4 * 4  # the group of four that one latent stands for moves as one, and nothing before it
-
-
-def _prove_first_moved(answer: Callable) -> None:
-    torch_state = torch.random.get_rng_state()
-    torch.manual_seed(0)
-    vae = MACVAE(VAEConfig(latent_dim=4, width=8, depth=2)).double().eval()
-    torch.random.set_rng_state(torch_state)
-    cases = [(8, frame) for frame in range(8)] + [(20, 11), (28, 18), (36, 33)]
-    for frames, frame in cases:
-        clip = torch.randn(1, frames, 263, dtype=torch.float64, generator=torch.Generator().manual_seed(frames))
-        edited = clip.clone()
-        edited[0, frame] += 1
-        with torch.no_grad():
-            change = vae.decode(vae.encode(edited)[0]) - vae.decode(vae.encode(clip)[0])  # (1,T,263)
-        first = int((change.abs().amax(-1)[0] > 1e-9).nonzero()[0])
-        guess = answer(frame)
-        law = f"In a random VAE an edit of frame {frame} of {frames} moves the output from frame "
-        must(guess <= first, law + "earlier on than that: a latent stands for a whole group of frames.")
-        must(guess >= first, law + "later on: nothing before the edited frame's own group moves, that is causality.")
-
-
-EXERCISES = {
-    exercise.id: exercise
-    for exercise in (
-        Exercise(
-            "00.1",
-            "one latent stands for four frames, and a started group of four needs a latent of its own. "
-            "The decoder draws whole groups; what was not asked for is cut from the joints.",
-            motion_shapes,
-            _prove_shapes,
-        ),
-        Exercise(
-            "00.2",
-            "which latent does the frame belong to, and which is the first frame that this latent draws?",
-            first_frame_moved,
-            _prove_first_moved,
-        ),
-    )
-}

@@ -1,0 +1,3 @@
+"""The exercises of notebook 15: scale up."""
+
+EXERCISES = ()
