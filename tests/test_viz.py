@@ -84,6 +84,35 @@ def test_page_errors_teach(joints_list, captions, message):
         player.html_page(joints_list, captions)
 
 
+def test_a_foot_is_in_the_air_or_planted_or_slides():
+    joints = np.repeat(motion(1), 8, axis=0)
+    joints[:, 10:12, 1] = 0.02  # both stand ...
+    joints[3:5, 11, 1] = 0.3  # ... but the right one is lifted in between
+    assert player.foot_contacts(joints).tolist() == [[1, 1]] * 3 + [[1, 0]] * 2 + [[1, 1]] * 3
+    joints[:, :, 0] += 0.03 * np.arange(8)[:, None]  # 0.6 m/s at 20 fps
+    assert player.foot_contacts(joints)[:, 0].tolist() == [2] * 8
+    assert player.foot_contacts(joints, fps=10).max() == 1
+    joints[3:, :, 0] = joints[3, 0, 0]  # the last step that slides ends in frame 3
+    assert player.foot_contacts(joints)[:, 0].tolist() == [2, 2, 2, 2, 1, 1, 1, 1]
+    assert player.foot_contacts(joints[:1]).tolist() == [[1, 1]]
+    clip = player.player_data([joints], ["a"])["clips"][0]
+    assert clip["contacts"][:8] == "22222220" and len(clip["contacts"]) == 2 * 8 and clip["noise"] is None
+
+
+def test_noise_is_packed_a_byte_a_frame_and_refused_where_it_does_not_fit():
+    joints, levels = motion(5), np.array([0, 0.2, 0.5, 1, 0])
+    clips = player.player_data([joints, joints], ["a", "b"], noise=[None, levels])["clips"]
+    assert clips[0]["noise"] is None and [*base64.b64decode(clips[1]["noise"])] == [0, 51, 128, 255, 0]
+    assert clips[1]["noise"] in player.html_page([joints, joints], ["a", "b"], noise=[None, levels])
+    for bad in (levels[:4], levels * 1.1, levels - 0.1, levels * np.nan, 0.5, levels[:, None]):
+        with pytest.raises(ValueError, match="noise must be 5 numbers from 0"):
+            player.player_data([joints], ["a"], noise=[bad])
+        with pytest.raises(ValueError, match="noise must be 5 numbers from 0"):
+            plots.pose_strip(joints, noise=bad)
+    with pytest.raises(ValueError, match="2 motions, 1 noises"):
+        player.player_data([joints, joints], ["a", "b"], noise=[levels])
+
+
 def colours(image):
     """Which of the limbs' colours an image shows."""
     pixels = np.asarray(image.convert("RGB")).reshape(-1, 3).astype(int)
@@ -101,6 +130,21 @@ def test_strip_shows_both_sides_and_grows_with_poses_and_caption(tmp_path):
     assert plots.pose_strip(motion(), poses=10).width == 2 * strip.width
     assert plots.pose_strip(motion(), poses=2, caption="word " * 30).height > strip.height + 30
     assert plots.pose_strip(motion(1), poses=3).width > 0
+
+
+def test_strip_turns_noisy_frames_greyish_red_and_shows_the_noise_below():
+    joints, levels = motion(9), np.linspace(0, 1, 9)
+    plain, noisy = plots.pose_strip(joints, poses=3), plots.pose_strip(joints, poses=3, noise=levels)
+    assert noisy.height == plain.height + 14
+    first, last = (noisy.crop((left, 0, left + 130, 200)) for left in (0, 260))
+    assert np.array_equal(np.asarray(first), np.asarray(plain.crop((0, 0, 130, 200))))
+    assert colours(first) == {"left", "right", "head"} and colours(last) == set()
+    bar = np.asarray(noisy)[204, 65:325].astype(int)
+    assert tuple(bar[0]) == plots.CLEAN and tuple(bar[-1]) == plots.NOISE and (np.diff(bar[:, 1]) <= 0).all()
+    assert plots.pose_strip(joints, poses=1, noise=levels).height == noisy.height
+    script = player.player_script()  # draws in the same colours
+    for colour in (plots.NOISE, plots.CLEAN, plots.LEFT, plots.RIGHT, plots.MIDDLE):
+        assert str(list(colour)) in script
 
 
 def test_left_arm_is_drawn_where_the_left_arm_is():

@@ -138,6 +138,22 @@ def test_player_has_a_picture_for_readers_without_a_kernel():
     assert np.array_equal(np.asarray(stand_in(one)), below)
 
 
+def test_player_shows_noise_as_colour_and_so_does_its_picture():
+    levels = np.linspace(0, 1, 6)
+    clean, noisy = (
+        SkeletonPlayer([joints()] * 2, ["a", "b"]),
+        SkeletonPlayer([joints()] * 2, ["a", "b"], noise=[None, levels]),
+    )
+    assert [clip["noise"] is None for clip in noisy.data["clips"]] == [True, False]
+    top, below = stand_in(clean).height // 2, stand_in(noisy)
+    assert below.height == stand_in(clean).height + 14
+    assert np.array_equal(np.asarray(below)[:top], np.asarray(stand_in(clean))[:top])
+    noisy.play([joints(4)], ["c"])
+    assert noisy.data["clips"][0]["noise"] is None and stand_in(noisy).height == top
+    with pytest.raises(ValueError, match="noise must be 4 numbers"):
+        noisy.play([joints(4)], ["c"], noise=[levels])
+
+
 def test_script_needs_no_network():
     script = SkeletonPlayer._esm
     script = script if isinstance(script, str) else str(script)

@@ -1,32 +1,47 @@
 // Plays skeletons on canvases: drag to orbit, wheel to zoom, scrub, play, change speed. No library, no network.
 //
 // minicmdmPlayer(root, data) fills the element `root` and returns {seek, play, pause, destroy}. `data` is
-//   {fps, parents: [22], sides: [22] ("left" | "right" | "middle"),
-//    clips: [{caption, frames, scale, joints}]}   joints: base64 of int16 (frames, 22, 3); times scale: metres.
+//   {fps, parents: [22], sides: [22] ("left" | "right" | "middle"), feet: [2],
+//    clips: [{caption, frames, scale, joints, contacts, noise}]}
+// joints: base64 of int16 (frames, 22, 3); times scale: metres. contacts: two digits a frame, left and right foot (0 in
+// the air, 1 planted, 2 sliding). noise: base64 of a byte a frame (255 is pure noise), or null.
 // A page calls it from a script tag; a notebook widget appends `export default {render}` and calls it there.
 // root.dataset.frame holds the frame on show, for tests.
 
 function minicmdmPlayer(root, data) {
   "use strict";
-  const COLOURS = { left: "#e07a1f", right: "#2563c9", middle: "#454b57" };
+  const COLOURS = { left: [224, 122, 31], right: [37, 99, 201], middle: [69, 75, 87] };
+  const [NOISE, CLEAN] = [[176, 112, 126], [214, 218, 226]]; // what noise turns limbs into; the scrub bar without any
+  const CONTACTS = { 1: ["rgba(20, 140, 80, 0.55)", "rgb(20, 120, 70)"], 2: ["transparent", "rgb(205, 20, 40)"] };
   const HOME = { yaw: 0.6, pitch: 0.22, distance: 3.9 };
   const SPEEDS = [0.25, 0.5, 1, 2];
-  const clips = data.clips.map((clip) => ({ ...clip, joints: decode(clip.joints, clip.scale) }));
+  const clips = data.clips.map((clip) => ({
+    ...clip, joints: decode(clip.joints, clip.scale), noise: clip.noise && bytesOf(clip.noise),
+  }));
   const frames = Math.max(...clips.map((clip) => clip.frames));
   const view = { ...HOME };
   let now = 0; // in frames; between two of them while playing
   let speed = 1;
   let playing = false;
   let trail = true;
+  let contacts = true;
   let lastTick = 0;
   let request = 0;
 
+  function bytesOf(text) {
+    return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  }
+
   function decode(text, scale) {
-    const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+    const bytes = bytesOf(text);
     const numbers = new DataView(bytes.buffer);
     const values = new Float32Array(bytes.length / 2);
     for (let i = 0; i < values.length; i++) values[i] = numbers.getInt16(2 * i, true) * scale;
     return values;
+  }
+
+  function mix(from, to, share) {
+    return `rgb(${from.map((value, i) => Math.round(value + (to[i] - value) * share)).join(", ")})`;
   }
 
   // ---- the page: one canvas per clip, one row of controls ---------------------------------------------
@@ -59,23 +74,42 @@ function minicmdmPlayer(root, data) {
     display: "flex", gap: "10px", alignItems: "center", padding: "8px 0", flexWrap: "wrap",
   });
   const playButton = make("button", bar, { width: "5.5em", padding: "4px 0" }, { type: "button" });
-  const slider = make("input", bar, { flex: "1 1 160px" }, {
+  const scrub = make("div", bar, { flex: "1 1 160px", minWidth: "0" });
+  const slider = make("input", scrub, { width: "100%", margin: "0", display: "block" }, {
     type: "range", min: 0, max: frames - 1, step: 1, value: 0, "aria-label": "Frame",
   });
+  for (const clip of clips) {
+    if (!clip.noise) continue;
+    const strip = make("canvas", make("div", scrub, { margin: "2px 8px 0" }), { // a thumb is 16 pixels wide
+      width: `${(100 * clip.frames) / frames}%`, height: "7px", display: "block", imageRendering: "pixelated",
+    }, { width: clip.frames, height: 1, role: "img", "aria-label": `Noise: ${clip.caption}`, title: "noise" });
+    clip.noise.forEach((noise, frame) => {
+      const context = strip.getContext("2d");
+      context.fillStyle = mix(CLEAN, NOISE, noise / 255);
+      context.fillRect(frame, 0, 1, 1);
+    });
+  }
   const clock = make("output", bar, { minWidth: "11em", fontVariantNumeric: "tabular-nums" });
   const speedMenu = make("select", bar, {}, { "aria-label": "Speed" });
   for (const value of SPEEDS) make("option", speedMenu, {}, { value }).textContent = `${value}×`;
   speedMenu.value = speed;
-  const trailLabel = make("label", bar, { whiteSpace: "nowrap" });
-  const trailBox = make("input", trailLabel, {}, { type: "checkbox" });
-  trailBox.checked = trail;
-  trailLabel.append(" trail");
+  function box(name, title, onchange) {
+    const label = make("label", bar, { whiteSpace: "nowrap" }, { title });
+    const input = make("input", label, {}, { type: "checkbox" });
+    input.checked = true;
+    input.onchange = () => { onchange(input.checked); draw(); };
+    label.append(` ${name}`);
+    return input;
+  }
+  const trailBox = box("trail", "where the pelvis has been and will be", (on) => (trail = on));
+  const contactBox = box("contacts", "disc: the foot is planted; ring: it slides", (on) => (contacts = on));
   const homeButton = make("button", bar, { padding: "4px 8px" }, { type: "button" });
   homeButton.textContent = "reset view";
   const legend = make("span", bar, { whiteSpace: "nowrap" });
   for (const side of ["left", "right"]) {
-    make("b", legend, { color: COLOURS[side], marginRight: "8px" }).textContent = side;
+    make("b", legend, { color: mix(COLOURS[side], NOISE, 0), marginRight: "8px" }).textContent = side;
   }
+  if (clips.some((clip) => clip.noise)) make("b", legend, { color: mix(NOISE, CLEAN, 0) }).textContent = "noise";
 
   // ---- the camera: turns about a point above the root's place on the floor ----------------------------
   function camera(clip, pose) {
@@ -138,10 +172,30 @@ function minicmdmPlayer(root, data) {
     }
   }
 
+  function drawContacts(context, project, pose, touching, pixel) {
+    data.feet.forEach((foot, i) => {
+      if (!CONTACTS[touching[i]]) return;
+      [context.fillStyle, context.strokeStyle] = CONTACTS[touching[i]];
+      context.lineWidth = 2.5 * pixel;
+      context.beginPath();
+      for (let turn = 0; turn < 6.28; turn += 0.2) {
+        const p = project(pose[3 * foot] + 0.12 * Math.cos(turn), 0, pose[3 * foot + 2] + 0.12 * Math.sin(turn));
+        if (p.away < 0.2) return;
+        context.lineTo(p.x, p.y);
+      }
+      context.closePath();
+      context.fill();
+      context.stroke();
+    });
+  }
+
   function drawClip(clip) {
     const context = clip.canvas.getContext("2d");
     const pixel = window.devicePixelRatio || 1;
     const pose = poseAt(clip, now);
+    const frame = Math.min(Math.floor(now), clip.frames - 1);
+    const noise = clip.noise ? clip.noise[frame] / 255 : 0;
+    const colour = (side) => mix(COLOURS[side], NOISE, 0.85 * noise); // a hint of left and right remains
     const project = camera(clip, pose);
     const at = (j) => project(pose[3 * j], pose[3 * j + 1], pose[3 * j + 2]);
     const shadow = (j) => project(pose[3 * j], 0, pose[3 * j + 2]);
@@ -156,16 +210,17 @@ function minicmdmPlayer(root, data) {
       lines(context, future, "rgba(180, 40, 90, 0.25)", 2 * pixel);
       lines(context, past, "rgba(180, 40, 90, 0.8)", 2 * pixel);
     }
+    if (contacts) drawContacts(context, project, pose, clip.contacts.slice(2 * frame, 2 * frame + 2), pixel);
     const bones = [];
     for (let j = 1; j < 22; j++) bones.push([data.parents[j], j]);
     // A shadow straight below shows at once what floats or sinks.
     const below = bones.map(([p, j]) => [shadow(p), shadow(j)]);
     lines(context, below, "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
     bones.sort((a, b) => at(b[0]).away + at(b[1]).away - at(a[0]).away - at(a[1]).away); // far ones first
-    for (const [p, j] of bones) lines(context, [[at(p), at(j)]], COLOURS[data.sides[j]], 0.038 * at(j).size);
+    for (const [p, j] of bones) lines(context, [[at(p), at(j)]], colour(data.sides[j]), 0.038 * at(j).size);
     const head = at(15);
     if (head.away > 0.2) {
-      context.fillStyle = COLOURS.middle;
+      context.fillStyle = colour("middle");
       context.beginPath();
       context.arc(head.x, head.y, 0.085 * head.size, 0, 7);
       context.fill();
@@ -225,7 +280,6 @@ function minicmdmPlayer(root, data) {
   playButton.onclick = () => (playing ? pause() : play());
   slider.oninput = () => seek(Number(slider.value));
   speedMenu.onchange = () => (speed = Number(speedMenu.value));
-  trailBox.onchange = () => { trail = trailBox.checked; draw(); };
   homeButton.onclick = () => { Object.assign(view, HOME); draw(); };
   for (const { canvas } of clips) {
     canvas.onpointerdown = (event) => {
@@ -251,7 +305,8 @@ function minicmdmPlayer(root, data) {
     Home: () => seek(0),
     End: () => seek(frames - 1),
     r: () => homeButton.onclick(),
-    t: () => { trailBox.checked = !trailBox.checked; trailBox.onchange(); },
+    t: () => trailBox.click(),
+    c: () => contactBox.click(),
   };
   function onKey(event) {
     event.stopPropagation(); // or JupyterLab takes the key for itself

@@ -14,6 +14,7 @@ from importlib import resources
 import numpy as np
 
 from minicmdm.data.skeleton import FPS, LEFT_JOINTS, NUM_JOINTS, PARENTS, RIGHT_JOINTS
+from minicmdm.evaluation.metrics import CONTACT_HEIGHT, FEET, SKATING_SPEED
 
 SIDES = ["left" if j in LEFT_JOINTS else "right" if j in RIGHT_JOINTS else "middle" for j in range(NUM_JOINTS)]
 
@@ -45,33 +46,82 @@ def player_script() -> str:
     return resources.files("minicmdm.viz").joinpath("player.js").read_text(encoding="utf-8")
 
 
-def player_data(joints_list: list[np.ndarray], captions: list[str], fps: float = FPS) -> dict:
+def foot_contacts(joints: np.ndarray, fps: float = FPS) -> np.ndarray:
+    """What the left and the right foot do in each frame (T, 2): 0 in the air, 1 planted, 2 sliding over the floor.
+
+    Joints (T, 22, 3) in metres; the floor is y = 0. Heights and speeds are those of `metrics.skating_ratio`.
+    """
+    feet = np.asarray(joints, dtype=np.float64)[:, FEET]  # (T,2,3)
+    low = feet[..., 1] < CONTACT_HEIGHT
+    speed = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) * fps  # (T-1,2)
+    step = low[:-1] & low[1:] & (speed > SKATING_SPEED)
+    slides = np.pad(step, ((1, 0), (0, 0))) | np.pad(step, ((0, 1), (0, 0)))  # in the step to or from this frame
+    return low.astype(int) + slides
+
+
+def player_data(
+    joints_list: list[np.ndarray],
+    captions: list[str],
+    fps: float = FPS,
+    noise: list[np.ndarray | None] | None = None,
+) -> dict:
     """What minicmdmPlayer draws, ready for JSON: motions (T, 22, 3) in metres as scaled int16 in base64.
 
-    ValueError when a motion is not (T, 22, 3) and finite, or when captions and motions differ in number.
+    `noise` holds for each motion how noisy its frames are, (T,) from 0 (clean) to 1, or None. ValueError when a motion
+    is not (T, 22, 3) and finite, a noise is not (T,) and within 0..1, or their numbers and the captions' differ.
     """
     joints_list = [np.asarray(joints, dtype=np.float64) for joints in joints_list]
     if not joints_list or len(joints_list) != len(captions):
         raise ValueError(f"expected one caption per motion, got {len(joints_list)} motions, {len(captions)} captions")
+    noise = [None] * len(joints_list) if noise is None else list(noise)
+    if len(noise) != len(joints_list):
+        raise ValueError(f"expected one noise per motion or None, got {len(joints_list)} motions, {len(noise)} noises")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps must be a positive number of frames per second, got {fps}")
     clips = []
-    for index, (joints, caption) in enumerate(zip(joints_list, captions)):
+    for index, (joints, caption, levels) in enumerate(zip(joints_list, captions, noise)):
         if joints.ndim != 3 or joints.shape[1:] != (NUM_JOINTS, 3) or len(joints) == 0:
             raise ValueError(f"motion {index} must have shape (T, {NUM_JOINTS}, 3), got {joints.shape}")
         if not np.isfinite(joints).all():
             raise ValueError(f"motion {index} holds NaN or infinite numbers")
         scale = max(float(np.abs(joints).max()), 1e-6) / 32767  # 0.1 mm within 3 m of the origin
-        packed = np.round(joints / scale).astype("<i2").tobytes()
-        encoded = base64.b64encode(packed).decode("ascii")
-        clips.append({"caption": str(caption), "frames": len(joints), "scale": scale, "joints": encoded})
-    return {"fps": float(fps), "parents": list(PARENTS), "sides": SIDES, "clips": clips}
+        clips.append(
+            {
+                "caption": str(caption),
+                "frames": len(joints),
+                "scale": scale,
+                "joints": _base64(np.round(joints / scale).astype("<i2")),
+                "contacts": "".join(map(str, foot_contacts(joints, fps).ravel())),
+                "noise": None if levels is None else _base64(np.uint8(np.round(255 * checked_noise(levels, joints)))),
+            }
+        )
+    return {"fps": float(fps), "parents": list(PARENTS), "sides": SIDES, "feet": list(FEET), "clips": clips}
 
 
-def html_page(joints_list: list[np.ndarray], captions: list[str], fps: float = FPS) -> str:
-    """A self-contained page that plays motions (T, 22, 3) side by side in step, each under its caption."""
+def checked_noise(levels: np.ndarray, joints: np.ndarray) -> np.ndarray:
+    """The noise of each frame as (T,) floats. ValueError: not one number from 0 to 1 for each frame of the motion."""
+    levels = np.asarray(levels, dtype=np.float64)
+    if levels.shape != joints.shape[:1] or not ((levels >= 0) & (levels <= 1)).all():
+        raise ValueError(f"noise must be {len(joints)} numbers from 0 (clean) to 1, one a frame, got {levels!r:.80}")
+    return levels
+
+
+def _base64(numbers: np.ndarray) -> str:
+    return base64.b64encode(numbers.tobytes()).decode("ascii")
+
+
+def html_page(
+    joints_list: list[np.ndarray],
+    captions: list[str],
+    fps: float = FPS,
+    noise: list[np.ndarray | None] | None = None,
+) -> str:
+    """A self-contained page that plays motions (T, 22, 3) side by side in step, each under its caption.
+
+    `noise` as in `player_data`.
+    """
     captions = [str(caption) for caption in captions]
-    data = json.dumps(player_data(joints_list, captions, fps))
+    data = json.dumps(player_data(joints_list, captions, fps, noise))
     for letter in "<>&":  # inside a script element only these could end it; JSON may write them as escapes
         data = data.replace(letter, f"\\u{ord(letter):04x}")
     return _PAGE.format(

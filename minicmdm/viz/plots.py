@@ -13,10 +13,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from minicmdm.data.skeleton import FPS, LEFT_JOINTS, NUM_JOINTS, PARENTS, RIGHT_JOINTS
+from minicmdm.viz.player import checked_noise
 
 PAPER, INK, SHADOW, TRAIL = (245, 246, 248), (31, 36, 48), (216, 219, 225), (205, 120, 150)
 LEFT, RIGHT, MIDDLE = (224, 122, 31), (37, 99, 201), (69, 75, 87)
-GRID = (212, 216, 223)
+GRID, NOISE, CLEAN = (212, 216, 223), (176, 112, 126), (214, 218, 226)  # as player.js has them
 COLOURS = [LEFT if j in LEFT_JOINTS else RIGHT if j in RIGHT_JOINTS else MIDDLE for j in range(NUM_JOINTS)]
 
 YAW, PITCH, DISTANCE = 0.6, 0.22, 4.4  # where the camera stands: radians, radians, metres from the root
@@ -24,21 +25,34 @@ HEAD_JOINT, HEAD_RADIUS, BONE_WIDTH = 15, 0.085, 0.04  # metres
 SMOOTH = 2  # drawn this many times too large, then reduced
 
 
-def pose_strip(joints: np.ndarray, path: str | Path | None = None, poses: int = 8, caption: str = "") -> Image.Image:
+def pose_strip(
+    joints: np.ndarray,
+    path: str | Path | None = None,
+    poses: int = 8,
+    caption: str = "",
+    noise: np.ndarray | None = None,
+) -> Image.Image:
     """A row of `poses` frames of joints (T, 22, 3), evenly spaced in time; left is orange, right is blue.
 
+    Where `noise` (T,), 0 clean to 1, is given, the limbs turn greyish red with it and a bar below shows every frame's.
     Returns the picture and, given a path, writes it there. ValueError for another shape or no poses.
     """
     joints = _checked(joints)
     if poses < 1:
         raise ValueError(f"poses must be at least 1, got {poses}")
+    levels = np.zeros(len(joints)) if noise is None else checked_noise(noise, joints)
     width, height = 130, 200
-    strip = Image.new("RGB", (width * poses, height), PAPER)
+    strip = Image.new("RGB", (width * poses, height + (0 if noise is None else 14)), PAPER)
     for column, frame in enumerate(np.linspace(0, len(joints) - 1, poses).round().astype(int)):
-        picture = _draw_frame(joints, frame, width, height)
+        picture = _draw_frame(joints, frame, width, height, levels[frame])
         pen = ImageDraw.Draw(picture)
         pen.text((width / 2, height - 6), f"{frame / FPS:.1f} s", fill=INK, font=_font(11), anchor="ms")
         strip.paste(picture, (column * width, 0))
+    if noise is not None:  # the bar goes from the middle of the first pose to the middle of the last
+        bar = np.uint8(np.round(CLEAN + levels[:, None] * np.subtract(NOISE, CLEAN)))[None]  # (1,T,3)
+        left = width // 2 if poses > 1 else 0
+        bar = Image.fromarray(bar).resize((strip.width - 2 * left, 6), Image.Resampling.NEAREST)
+        strip.paste(bar, (left, height + 2))
     strip = _with_caption(strip, caption)
     if path is not None:
         strip.save(path)
@@ -83,8 +97,9 @@ def save_loss_curves(csv_path: str | Path, png_path: str | Path) -> None:
     figure.savefig(png_path, dpi=100)
 
 
-def _draw_frame(joints: np.ndarray, frame: int, width: int, height: int) -> Image.Image:
+def _draw_frame(joints: np.ndarray, frame: int, width: int, height: int, noise: float = 0.0) -> Image.Image:
     """One frame in perspective, camera on the root: floor, path so far, shadow, bones from far to near."""
+    colours = [tuple(np.round(c + 0.85 * noise * np.subtract(NOISE, c)).astype(int)) for c in (*COLOURS, MIDDLE)]
     width, height = width * SMOOTH, height * SMOOTH
     picture = Image.new("RGB", (width, height), PAPER)
     pen = ImageDraw.Draw(picture)
@@ -107,8 +122,8 @@ def _draw_frame(joints: np.ndarray, frame: int, width: int, height: int) -> Imag
         pen.line([*shadow[PARENTS[j]], *shadow[j]], fill=SHADOW, width=round(BONE_WIDTH * scale[j]))
     pixels, scale = project(pose)
     for j in sorted(range(1, NUM_JOINTS), key=lambda j: scale[j] + scale[PARENTS[j]]):  # far ones first
-        _bone(pen, pixels[PARENTS[j]], pixels[j], COLOURS[j], BONE_WIDTH * scale[j])
-    _disc(pen, pixels[HEAD_JOINT], HEAD_RADIUS * scale[HEAD_JOINT], MIDDLE)
+        _bone(pen, pixels[PARENTS[j]], pixels[j], colours[j], BONE_WIDTH * scale[j])
+    _disc(pen, pixels[HEAD_JOINT], HEAD_RADIUS * scale[HEAD_JOINT], colours[-1])
     return picture.reduce(SMOOTH)
 
 

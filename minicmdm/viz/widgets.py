@@ -56,23 +56,26 @@ export default {
 
 
 class SkeletonPlayer(anywidget.AnyWidget):
-    """The player of motions (T, 22, 3) in metres, side by side in step, each under its caption."""
+    """The player of motions (T, 22, 3) in metres, side by side in step, each under its caption.
+
+    `noise` may hold for each motion how noisy its frames are, (T,) from 0 to 1, or None: noise is shown as colour.
+    """
 
     _esm = player_script() + _RENDER
     data = traitlets.Dict().tag(sync=True)  # what viz.player.player_data packs
 
-    def __init__(self, joints_list: list[np.ndarray], captions: list[str], fps: float = FPS):
+    def __init__(self, joints_list: list, captions: list[str], fps: float = FPS, noise: list | None = None):
         super().__init__()
-        self.play(joints_list, captions, fps)
+        self.play(joints_list, captions, fps, noise)
 
-    def play(self, joints_list: list[np.ndarray], captions: list[str], fps: float = FPS) -> None:
+    def play(self, joints_list: list, captions: list[str], fps: float = FPS, noise: list | None = None) -> None:
         """Show other motions. ValueError where `viz.player.player_data` finds one."""
-        self.data = player_data(joints_list, captions, fps)
-        self._shown = list(zip(joints_list, captions))
+        self.data = player_data(joints_list, captions, fps, noise)
+        self._shown = list(zip(joints_list, captions, noise or [None] * len(captions)))
 
     def picture(self) -> Image.Image:
         """The static stand-in: a strip of poses for each motion, one below the other."""
-        strips = [pose_strip(joints, caption=caption) for joints, caption in self._shown]
+        strips = [pose_strip(joints, caption=caption, noise=noise) for joints, caption, noise in self._shown]
         whole = Image.new("RGB", (strips[0].width, sum(strip.height for strip in strips)))
         heights = np.cumsum([0, *(strip.height for strip in strips)])
         for strip, top in zip(strips, heights.tolist()):
