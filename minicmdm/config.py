@@ -104,6 +104,7 @@ class TrainConfig:
     dit_batch: int = 64
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
+    dit_muon: float = 0.0  # Muon's learning rate for the blocks' matrices (ours); 0: AdamW for all, as the release
     levels: str = "random"  # of the latents: independent (CMDM Alg. 1), or "staircase", as FSS will present them
     time_power: float = 1.0  # random times are u ** time_power: 1 is the paper's, more draws noisy latents more often
     ema: float = 0.9999
@@ -200,10 +201,11 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=6_500,
+            dit_steps=6_000,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
+            dit_muon=3e-3,
             ema=0.999,
             weight_decay=0.0,
         ),

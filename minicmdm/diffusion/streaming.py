@@ -8,7 +8,7 @@ It gives what `sampling.sample` gives, and does less for it:
   blocks, a block is final when all of it is finished. Under "bidirectional" attention nothing ever is, because finished
   latents look at those in flight: there the whole window is evaluated in every call.
 * Modulation depends on the level alone and is computed for the K+1 levels once; the keys and values of words once a
-  prompt.
+  prompt. Weights are laid out once for products of few rows (models/packed.py).
 
 All this is exact. What slides is the past: a call sees `window` latents at most, finished ones and those in flight, and
 the oldest finished one leaves when a new one starts. Up to there the stream is the dense sampler; beyond, memory and
@@ -31,6 +31,7 @@ from minicmdm.diffusion.path import euler_step, level_to_time
 from minicmdm.diffusion.schedules import schedule_matrix
 from minicmdm.models.dit import CausalDiT, clock_features, self_attention_mask
 from minicmdm.models.layers import KeyValueCache
+from minicmdm.models.packed import packed
 from minicmdm.models.text import Words
 
 LONGEST = 49  # latents: the longest motion in training, hence the usual window, and a page of noise
@@ -126,6 +127,8 @@ class LatentStream:
             self.modulations = dit.modulations(self.times)  # per block (K+1,6*dim)
             # now, and what is to come
             self.said = [Said(0, sentences, nothing, lengths, *self._read(sentences))]
+            copies = len(generators) * len(self.branches)
+            self.packed = packed(dit, copies * int(min(self.ahead, self.window)))  # for `evaluate` alone
 
     @property
     def started(self) -> int:
@@ -242,7 +245,7 @@ class LatentStream:
             since, left = since % again, torch.where(lasts > 0, lasts - 1 - since % again, -1)
             clock = torch.stack([since, left], dim=-1)  # (B,n,2)
             told = clock_features(self.z[..., 0], clock).to(self.model_dtype).repeat(copies, 1, 1)
-        v = self.dit.evaluate(
+        v = self.packed.evaluate(
             self.z.to(self.model_dtype).repeat(copies, 1, 1),
             which.expand(copies * len(self.z), -1),
             self.modulations,

@@ -47,7 +47,7 @@ def train_dit(
             losses.append(denoising_loss(ema["dit"], words, val_latents, plan, 64, 0.0, generator).item())
         return {"val_loss": float(np.mean(losses))}
 
-    config = loop_config(plan, cfg.dit_steps, cfg.dit_lr, cfg.dit_warmup)
+    config = loop_config(plan, cfg.dit_steps, cfg.dit_lr, cfg.dit_warmup, cfg.dit_muon)
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
     for name in ("vae.safetensors", "text/model.safetensors"):
         identity[name] = checkpoints.checksum(out / name)

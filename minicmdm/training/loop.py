@@ -26,6 +26,7 @@ from tqdm import tqdm
 from minicmdm.config import Preset
 from minicmdm.files import whole_file
 from minicmdm.training.checkpoints import load_tensors, save_tensors
+from minicmdm.training.muon import Muon, inner_matrices
 
 
 @dataclass(frozen=True)
@@ -39,13 +40,14 @@ class LoopConfig:
     weight_decay: float = 0.0
     grad_clip: float = 1.0
     ema: float = 0.999
+    muon: float = 0.0  # Muon's learning rate for the matrices of transformer blocks; 0: AdamW for everything
     seed: int = 0
     log_every: int = 20
     validate_every: int = 500
     save_every: int = 500
 
 
-def loop_config(plan: Preset, steps: int, lr: float, warmup: int) -> LoopConfig:
+def loop_config(plan: Preset, steps: int, lr: float, warmup: int, muon: float = 0.0) -> LoopConfig:
     """A stage's loop: what differs between the stages is given, the rest is the plan's."""
     cfg, every = plan.train, max(1, min(500, steps // 4))
     return LoopConfig(
@@ -56,6 +58,7 @@ def loop_config(plan: Preset, steps: int, lr: float, warmup: int) -> LoopConfig:
         weight_decay=cfg.weight_decay,
         grad_clip=cfg.grad_clip,
         ema=cfg.ema,
+        muon=muon,
         seed=cfg.seed,
         log_every=max(1, min(20, steps // 4)),
         validate_every=every,
@@ -93,6 +96,16 @@ def learning_rate(config: LoopConfig, step: int) -> float:
     return config.lr * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
+def make_optimizers(models: nn.Module, config: LoopConfig) -> dict[str, torch.optim.Optimizer]:
+    """AdamW for all weights that learn, or for what Muon leaves; their names are those of their state on disk."""
+    matrices = inner_matrices(models) if config.muon else []
+    inner = {id(weight) for weight in matrices}
+    others = [weight for weight in models.parameters() if weight.requires_grad and id(weight) not in inner]
+    how = {"betas": config.betas, "weight_decay": config.weight_decay, "fused": True}
+    optimizers: dict[str, torch.optim.Optimizer] = {"adamw": torch.optim.AdamW(others, lr=config.lr, **how)}
+    return optimizers | ({"muon": Muon(matrices, config.muon)} if matrices else {})
+
+
 @torch.no_grad()
 def update_ema(ema: nn.Module, model: nn.Module, decay: float, step: int) -> None:
     """Move the average towards the model: w <- decay w + (1 - decay) model. Early on the decay is smaller, so that
@@ -125,12 +138,11 @@ def fit(
     table_file = folder / f"losses_{name}.csv"
     ema = copy.deepcopy(models).eval().requires_grad_(False)
     weights = [weight for weight in models.parameters() if weight.requires_grad]
-    optimizer = torch.optim.AdamW(
-        weights, lr=config.lr, betas=config.betas, weight_decay=config.weight_decay, fused=True
-    )
+    optimizers = make_optimizers(models, config)
+    tops = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
     start, seconds, table, metrics = 0, 0.0, [], {}
     if resume and state_file.is_file():
-        start, seconds, table, metrics = _restore(state_file, models, ema, optimizer, identity)
+        start, seconds, table, metrics = _restore(state_file, models, ema, optimizers, identity)
 
     models.train()
     clock = time.perf_counter() - seconds
@@ -140,13 +152,14 @@ def fit(
         with torch.random.fork_rng(devices=[]):  # the layers' own dropout draws from the global generator: key it too
             torch.manual_seed(key)
             value, numbers = loss(models, step, torch.Generator().manual_seed(key))
-        optimizer.param_groups[0]["lr"] = learning_rate(config, step)
-        optimizer.zero_grad(set_to_none=True)
+        models.zero_grad(set_to_none=True)
         value.backward()
         norm = nn.utils.clip_grad_norm_(weights, config.grad_clip)
         if not torch.isfinite(norm):
             raise ValueError(f"training {name}: the gradient at step {step} is not finite; try a lower learning rate")
-        optimizer.step()
+        for name, optimizer in optimizers.items():
+            optimizer.param_groups[0]["lr"] = learning_rate(config, step) / config.lr * tops[name]
+            optimizer.step()
         update_ema(ema, models, config.ema, step)
 
         done, last = step + 1, step + 1 == config.steps
@@ -160,7 +173,7 @@ def fit(
             metrics = validate(ema)
             table.append({"step": done, **metrics})
         if done % config.save_every == 0 or last:
-            _save(state_file, models, ema, optimizer, done, time.perf_counter() - clock, table, metrics, identity)
+            _save(state_file, models, ema, optimizers, done, time.perf_counter() - clock, table, metrics, identity)
             write_table(table_file, table)
         bar.update(1)
     bar.close()
@@ -173,32 +186,34 @@ def fit(
     return LoopResult(ema, metrics, seconds if start >= config.steps else time.perf_counter() - clock)
 
 
-def _save(path, models, ema, optimizer, step, seconds, table, metrics, identity) -> None:
+def _save(path, models, ema, optimizers, step, seconds, table, metrics, identity) -> None:
     """Everything the next life needs, in one file: tensors as tensors, the rest as JSON in the same file's header."""
     tensors = {f"model.{key}": value for key, value in models.state_dict().items()}
     tensors |= {f"ema.{key}": value for key, value in ema.state_dict().items()}
-    for index, moments in optimizer.state_dict()["state"].items():
-        tensors |= {f"optimizer.{index}.{key}": value for key, value in moments.items()}
+    for name, optimizer in optimizers.items():
+        for index, moments in optimizer.state_dict()["state"].items():
+            tensors |= {f"{name}.{index}.{key}": value for key, value in moments.items()}
     note = {"step": step, "seconds": seconds, "table": table, "metrics": metrics, "identity": dict(identity)}
     save_tensors(path, tensors, note)
 
 
-def _restore(path, models, ema, optimizer, identity) -> tuple[int, float, list[dict], dict]:
+def _restore(path, models, ema, optimizers, identity) -> tuple[int, float, list[dict], dict]:
     tensors, note = load_tensors(path)
     theirs = note.get("identity", {}) if isinstance(note, dict) else {}
     if other := [key for key in identity if theirs.get(key) != identity[key]]:
         raise ValueError(f"{path} is the state of another run (its {', '.join(other)} differ): use another --out")
-    groups: dict[str, dict] = {"model": {}, "ema": {}, "optimizer": {}}
+    groups: dict[str, dict] = {"model": {}, "ema": {}, **{name: {} for name in optimizers}}
     for key, value in tensors.items():
         group, _, rest = key.partition(".")
         groups[group][rest] = value
     models.load_state_dict(groups["model"])
     ema.load_state_dict(groups["ema"])
-    moments: dict[int, dict[str, Tensor]] = {}
-    for key, value in groups["optimizer"].items():
-        index, _, which = key.partition(".")
-        moments.setdefault(int(index), {})[which] = value
-    optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
+    for name, optimizer in optimizers.items():
+        moments: dict[int, dict[str, Tensor]] = {}
+        for key, value in groups[name].items():
+            index, _, which = key.partition(".")
+            moments.setdefault(int(index), {})[which] = value
+        optimizer.load_state_dict({**optimizer.state_dict(), "state": moments})
     return note["step"], note["seconds"], note["table"], note["metrics"]
 
 
