@@ -139,7 +139,7 @@ def fit(
     ema = copy.deepcopy(models).eval().requires_grad_(False)
     weights = [weight for weight in models.parameters() if weight.requires_grad]
     optimizers = make_optimizers(models, config)
-    tops = {name: optimizer.param_groups[0]["lr"] for name, optimizer in optimizers.items()}
+    tops = {kind: optimizer.param_groups[0]["lr"] for kind, optimizer in optimizers.items()}
     start, seconds, table, metrics = 0, 0.0, [], {}
     if resume and state_file.is_file():
         start, seconds, table, metrics = _restore(state_file, models, ema, optimizers, identity)
@@ -157,8 +157,8 @@ def fit(
         norm = nn.utils.clip_grad_norm_(weights, config.grad_clip)
         if not torch.isfinite(norm):
             raise ValueError(f"training {name}: the gradient at step {step} is not finite; try a lower learning rate")
-        for name, optimizer in optimizers.items():
-            optimizer.param_groups[0]["lr"] = learning_rate(config, step) / config.lr * tops[name]
+        for kind, optimizer in optimizers.items():
+            optimizer.param_groups[0]["lr"] = learning_rate(config, step) / config.lr * tops[kind]
             optimizer.step()
         update_ema(ema, models, config.ema, step)
 
