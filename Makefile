@@ -36,11 +36,11 @@ demo: $(VENV)/.runtime  ## three sentences, three motions: an HTML player and a 
 test: $(VENV)/.dev  ## lint, tests and notebooks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadgroup -rs
 	MINICMDM_FAST=1 $(BIN)/pytest --nbmake notebooks --nbmake-timeout=90
 
-quick: $(VENV)/.dev  ## tests alone
-	$(BIN)/pytest -n 2
+quick: $(VENV)/.dev  ## tests alone, without the browser
+	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser"
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check --fix .
