@@ -193,9 +193,23 @@ def test_a_control_changes_what_the_browser_gets(explorer):
 def test_an_impossible_state_is_said_and_left_again(explorer):
     explorer.inputs["num_steps"].value = 1
     assert "L = 3 is more than K = 1" in explorer.canvas.data["problem"] and explorer.canvas.data["rows"] == 0
-    assert explorer.row.value == 0 and explorer.picture().size[0] == mx.WIDTH
+    assert explorer.row.value == 24 and explorer.picture().size[0] == mx.WIDTH  # the cursor stays where it was
     explorer.inputs["uncertainty"].value = 1
     assert explorer.canvas.data["problem"] == "" and explorer.row.max == 12
+    explorer.inputs["uncertainty"].value = 3
+    explorer.inputs["num_steps"].value = 12
+    assert explorer.row.max == 45 and explorer.row.value == 12
+
+
+def test_a_film_that_comes_too_late_is_not_shown(explorer):
+    def slow(matrix):
+        explorer._film = known(lambda matrix: fake_film(matrix))
+        explorer.inputs["uncertainty"].value = 6  # as another thread does while this one samples
+        return fake_film(matrix)
+
+    explorer._film = known(slow)
+    explorer.inputs["uncertainty"].value = 5
+    assert explorer.canvas.data["rows"] == 79 == len(explorer.poses) == len(explorer.seen.matrix)
 
 
 def test_a_new_schedule_shows_at_once_and_its_film_when_the_controls_rest(monkeypatch):

@@ -26,6 +26,7 @@ export default {
     const canvas = make("canvas", root, { width: "100%", display: "block", cursor: "row-resize", touchAction: "none" });
     canvas.setAttribute("role", "img");
     const line = make("div", root, { padding: "2px 0 0 6%", minHeight: "1.4em", fontVariantNumeric: "tabular-nums" }, "fss-line");
+    const heat = document.createElement("canvas"); // the matrix, one pixel a level
     let data, levels, colours, poses;
 
     function bytes(view) { // a DataView need not begin where its buffer does
@@ -36,6 +37,10 @@ export default {
       data = model.get("data");
       [levels, colours] = [bytes(data.levels), bytes(data.colours)];
       poses = new Int16Array(bytes(data.poses).slice().buffer); // (M,N,22,2) millimetres
+      [heat.width, heat.height] = [data.latents, Math.max(data.rows, 1)];
+      const pixels = heat.getContext("2d").createImageData(heat.width, heat.height);
+      levels.forEach((level, i) => pixels.data.set([...colours.slice(3 * level, 3 * level + 3), 255], 4 * i));
+      heat.getContext("2d").putImageData(pixels, 0, 0);
       facts.replaceChildren();
       for (const [name, value] of data.facts) {
         const fact = make("div", facts, {});
@@ -68,7 +73,7 @@ export default {
       const at = (n) => levels[row * data.latents + n];
       pen.font = "12px system-ui, sans-serif";
       pen.textBaseline = "middle";
-      drawHeat(pen, row, wide);
+      drawHeat(pen, row);
       const base = 4 + HEAT + BARS;
       const floor = base + POSES;
       label(pen, "noise k", base - BARS / 2);
@@ -89,14 +94,10 @@ export default {
       pen.fillText(text, LEFT - 8, y);
     }
 
-    function drawHeat(pen, row, wide) {
+    function drawHeat(pen, row) {
       const high = HEAT / data.rows;
-      for (let m = 0; m < data.rows; m++) {
-        for (let n = 0; n < data.latents; n++) {
-          pen.fillStyle = colour(levels[m * data.latents + n]);
-          pen.fillRect(LEFT + n * wide, 4 + m * high, wide + 0.5, high + 0.5);
-        }
-      }
+      pen.imageSmoothingEnabled = false; // or rows would run into each other
+      pen.drawImage(heat, LEFT, 4, WIDE - LEFT - RIGHT, HEAT);
       pen.strokeStyle = INK;
       pen.lineWidth = 2;
       pen.strokeRect(LEFT - 3, 4 + row * high, WIDE - LEFT - RIGHT + 6, Math.max(high, 2));

@@ -9,6 +9,7 @@ which only paints: dragging m asks nobody, and a new schedule shows at once whil
 from __future__ import annotations
 
 import asyncio
+import threading
 from dataclasses import dataclass
 from importlib import resources
 
@@ -19,22 +20,19 @@ from PIL import Image, ImageDraw
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.skeleton import PARENTS
 from minicmdm.diffusion.sampling import sample_steps
-from minicmdm.diffusion.schedules import KINDS, ScheduleCost, cost, literal_matrix, schedule_matrix
+from minicmdm.diffusion.schedules import KINDS, cost, literal_matrix, schedule_matrix
 from minicmdm.viz import plots
 from minicmdm.viz.widgets import _with_png, anywidget, ipywidgets, traitlets
 
 LITERAL = "Eq. 13 to the letter"
-CONTROLS = {  # as `widgets.explore` takes them: least, default, greatest, or the choices, the default first
-    "kind": ["fss", *(kind for kind in KINDS if kind != "fss"), LITERAL],
-    "num_steps": (1, 12, 20),
-    "uncertainty": (0, 3, 20),
-    "num_latents": (4, 12, 16),
-    "block_size": (1, 1, 4),
-}
+KIND = ["fss", *(kind for kind in KINDS if kind != "fss"), LITERAL]
+# As `widgets.explore` takes them: the choices, the default first, or the least, the default and the greatest.
+CONTROLS = dict(kind=KIND, num_steps=(1, 12, 20), uncertainty=(0, 3, 20), num_latents=(4, 12, 16), block_size=(1, 1, 4))
 NAMES = dict(kind="kind", num_steps="steps K", uncertainty="stagger L", num_latents="latents N", block_size="block")
 ROW = 24  # where the cursor stands at first
 PAUSE = 0.35  # seconds without a change before a film is made
 NOISY, HALF, CLEAN = (150, 62, 88), (236, 170, 120), (222, 233, 240)  # the colour of level K, of K / 2 and of 0
+PALE = (225, 205, 210)  # what noise turns limbs into
 
 
 @dataclass(frozen=True)
@@ -43,16 +41,15 @@ class Look:
 
     matrix: np.ndarray  # (M,N) noise levels
     colours: np.ndarray  # (K+1,3) uint8, the colour of each level
-    price: ScheduleCost | None = None
     problem: str = ""
 
     @property
     def facts(self) -> list[tuple[str, str]]:
         """The five numbers under their names."""
-        if self.price is None:
+        if self.problem:
             return []
         names = ("rows M", "calls", "latents in flight", "calls to the first latent", "calls per further latent")
-        price, ready = self.price, (self.matrix > 0).sum(axis=0)  # (N,) the call after which each is clean
+        price, ready = cost(self.matrix), (self.matrix > 0).sum(axis=0)  # (N,) the call after which each is clean
         later = int((ready > ready.min()).sum())  # latents that come after the first ones
         further = (price.calls - price.calls_to_first) / later if later else 0
         values = (price.rows, price.calls, price.latents_in_flight, price.calls_to_first, round(further, 2))
@@ -62,9 +59,7 @@ class Look:
         """Row m in words."""
         levels = self.matrix[row]
         clean, waiting = int((levels == 0).sum()), int((levels == self.matrix[0, 0]).sum())
-        ready = int(
-            (np.append(levels, 1) > 0).argmax()
-        )  # finished latents at the left: what a stream has already shown
+        ready = int((np.append(levels, 1) > 0).argmax())  # how many at the left are clean, one after the other
         return (
             f"row m = {row} of {len(self.matrix) - 1}: {clean} latents clean, {len(levels) - clean - waiting} between, "
             f"{waiting} still pure noise. {4 * ready} frames, {ready / 5:.1f} s, can be shown."
@@ -82,11 +77,10 @@ def look(kind: str, num_steps: int, uncertainty: int, num_latents: int, block_si
         else:
             matrix = schedule_matrix(num_latents, num_steps, uncertainty, block_size, kind)
     except ValueError as error:
-        problem = f"L = {uncertainty} is no stagger here: {error}."
-        if uncertainty > num_steps:
-            problem = f"L = {uncertainty} is more than K = {num_steps}: a latent would wait on after the one before it."
-        return Look(np.zeros((0, num_latents), np.int64), colours, problem=problem)
-    return Look(matrix, colours, cost(matrix))
+        why = f"is more than K = {num_steps}: a latent would wait on after the one before it"
+        why = why if uncertainty > num_steps else f"is no stagger here: {error}"
+        return Look(np.zeros((0, num_latents), np.int64), colours, f"L = {uncertainty} {why}.")
+    return Look(matrix, colours)
 
 
 class Film:
@@ -96,6 +90,7 @@ class Film:
         self._pipe, self.prompt, self._seed, self._seen = pipe, prompt, seed, {}
 
     def known(self, matrix: np.ndarray) -> bool:
+        """Whether it has been sampled."""
         return (matrix.shape, matrix.tobytes()) in self._seen
 
     @torch.no_grad()
@@ -104,8 +99,8 @@ class Film:
 
         The pose is seen by the camera of `pose_strip`, from the foot of its root: to the right, and up.
         """
+        pipe, count = self._pipe, matrix.shape[1]
         if not self.known(matrix):
-            pipe, count = self._pipe, matrix.shape[1]
             noise = pipe._noise(torch.Generator().manual_seed(self._seed), count)[None]
             # The model is not told the length, so that more latents only add to the right.
             denoise = pipe._denoiser([self.prompt], torch.ones(1, count, dtype=torch.bool), 3.0, False)
@@ -119,7 +114,6 @@ class Film:
 # --- the picture for readers without a kernel -------------------------------------------------------------------------
 
 WIDTH, LEFT, TOP, HEIGHT, BARS, POSES, HEAD = 1000, 64, 48, 230, 56, 130, 5  # pixels
-PALE = (225, 205, 210)  # what noise turns limbs into
 
 
 def picture(seen: Look, row: int, poses: np.ndarray | None = None) -> Image.Image:
@@ -142,8 +136,8 @@ def picture(seen: Look, row: int, poses: np.ndarray | None = None) -> Image.Imag
         if text[0] == "m" or abs(y - top - tall / 2) > 14:
             pen.text((LEFT - 8, y), text, fill=ink, font=small, anchor="rm")
     base, floor = TOP + HEIGHT + BARS + 6, TOP + HEIGHT + BARS + POSES + 6
-    pen.text((LEFT - 8, base - BARS / 2), "noise k", fill=ink, font=small, anchor="rm")
-    pen.text((LEFT - 8, floor - POSES / 2), "poses", fill=ink, font=small, anchor="rm")
+    for text, y in [("noise k", base - BARS / 2), ("poses", floor - POSES / 2)]:
+        pen.text((LEFT - 8, y), text, fill=ink, font=small, anchor="rm")
     for n, level in enumerate(levels.tolist()):
         left, middle = LEFT + n * wide, LEFT + (n + 0.5) * wide
         top = base - (BARS - 16) * level / steps - 2
@@ -152,8 +146,8 @@ def picture(seen: Look, row: int, poses: np.ndarray | None = None) -> Image.Imag
         pen.text((middle, floor + 14), f"latent {n}" if wide > 55 else str(n), fill=ink, font=small, anchor="ms")
         if poses is not None:
             place = [middle, floor - 8] + poses[row, n] * [1, -1] / 1000 * POSES / 2.3  # (22,2) pixels
-            inks = plots.COLOURS + (0.86 * level / steps) * (np.array(PALE) - plots.COLOURS)  # (22,3)
-            inks = [tuple(one) for one in inks.astype(int).tolist()]
+            faded = plots.COLOURS + (0.86 * level / steps) * (np.array(PALE) - plots.COLOURS)  # (22,3)
+            inks = list(map(tuple, faded.astype(int).tolist()))
             for j in range(1, len(PARENTS)):
                 pen.line([*place[PARENTS[j]], *place[j]], fill=inks[j], width=3)
             plots._disc(pen, place[plots.HEAD_JOINT], HEAD, inks[plots.HEAD_JOINT])
@@ -176,27 +170,23 @@ class MatrixExplorer(ipywidgets.VBox):
     """Controls over the canvas. `film` turns a matrix into poses, as `Film` does; None shows none."""
 
     def __init__(self, film: Film | None = None):
-        self._film, self._later, self.seen, self.poses = film, None, None, None
+        self._film, self._later, self._one = film, None, threading.RLock()
         defaults = {name: control[0 if name == "kind" else 1] for name, control in CONTROLS.items()}
         for name, control in CONTROLS.items():  # a broken state fails the notebook here
-            for value in control:
-                seen = look(**(defaults | {name: value}))
-                poses = film(seen.matrix) if film and not seen.problem else None
-                for row in {0, len(seen.matrix) // 2, max(len(seen.matrix) - 1, 0)}:
-                    picture(seen, row, poses)
+            for seen in [look(**(defaults | {name: value})) for value in control]:
+                for row in {0, len(seen.matrix) // 2, len(seen.matrix) - 1}:
+                    picture(seen, row, film(seen.matrix) if film and not seen.problem else None)
         self.inputs = {name: _control(name, control) for name, control in CONTROLS.items()}
-        self.canvas, style = MatrixCanvas(), {"description_width": "initial"}
-        self.row = ipywidgets.IntSlider(ROW, 0, ROW, description="row m", style=style, layout={"width": "70%"})
+        self.canvas, wide = MatrixCanvas(row=ROW), {"width": "70%"}
+        self.row = ipywidgets.IntSlider(ROW, 0, ROW, description="row m", layout=wide).add_class("fss-row")
         self.clock = ipywidgets.Play(value=ROW, min=0, max=ROW, interval=90)
-        self.row.add_class("fss-row")
         # In the browser, so that dragging asks no kernel.
-        followers = [(self.canvas, "row"), (self.clock, "value")]
-        self._links = [ipywidgets.jslink((self.row, "value"), follower) for follower in followers]
+        ends = [(self.canvas, "row"), (self.clock, "value")]
+        self._links = [ipywidgets.jslink((self.row, "value"), end) for end in ends]
         for name, widget in self.inputs.items():
             widget.add_class(f"fss-{name.replace('_', '-')}")  # hooks for tests in a browser
             widget.observe(self._changed, "value")
-        self._show(film=True)
-        self.row.value = self.canvas.row = self.clock.value = min(ROW, self.row.max)
+        self._show()
         top = ipywidgets.HBox([*self.inputs.values()], layout={"flex_flow": "row wrap"})
         super().__init__([top, ipywidgets.HBox([self.clock, self.row]), self.canvas])
 
@@ -204,38 +194,47 @@ class MatrixExplorer(ipywidgets.VBox):
         """Show the new schedule at once, and its film as soon as the controls rest."""
         if self._later is not None:
             self._later.cancel()
-        if not self._show(film=False):
-            return
-        try:
-            self._later = asyncio.get_running_loop().call_later(PAUSE, self._show)
-        except RuntimeError:  # no kernel, nobody drags
-            self._show()
+        if self._show(film=False):
+            try:
+                self._later = asyncio.get_running_loop().call_later(PAUSE, self._show)
+            except RuntimeError:  # no kernel, nobody drags
+                self._show()
+
+    def _state(self) -> dict:
+        return {name: widget.value for name, widget in self.inputs.items()}
 
     def _show(self, film: bool = True) -> bool:
         """Show what the controls say; True if its film is still to be made."""
-        self.seen = seen = look(**{name: widget.value for name, widget in self.inputs.items()})
+        state, poses = self._state(), None
+        seen = look(**state)
         rows, count = seen.matrix.shape
-        waits = not film and self._film is not None and rows > 0 and not self._film.known(seen.matrix)
-        self.poses, problem = None, seen.problem
-        if self._film is not None and rows > 0 and not waits:
+        problem, filmed = seen.problem, self._film is not None and rows > 0
+        waits = filmed and not film and not self._film.known(seen.matrix)
+        if filmed and not waits:
             try:
-                self.poses = self._film(seen.matrix)
+                poses = self._film(seen.matrix)
             except Exception as error:  # it would vanish unseen
                 problem = f"{type(error).__name__}: {error}"
-        self.row.max = self.clock.max = max(rows - 1, 0)
-        self.canvas.row = min(self.canvas.row, self.row.max)
-        self.canvas.data = {
+        data = {
             "rows": rows, "latents": count, "steps": len(seen.colours) - 1, "problem": problem,
             "levels": seen.matrix.astype(np.uint8).tobytes(), "colours": seen.colours.tobytes(),
             "facts": seen.facts, "lines": [seen.line(row) for row in range(rows)],
-            "poses": b"" if self.poses is None else self.poses.tobytes(), "waits": waits,
+            "poses": b"" if poses is None else poses.tobytes(), "waits": waits,
             "head": plots.HEAD_JOINT, "bones": [[PARENTS[j], j, *plots.COLOURS[j]] for j in range(1, len(PARENTS))],
         }  # fmt: skip
+        with self._one:  # JupyterLab lets callbacks run beside each other
+            if state != self._state():
+                return False  # the controls have moved on, and whoever moved them shows it
+            self.seen, self.poses = seen, poses
+            if rows:  # an impossible state leaves the cursor where it was
+                self.row.max = self.clock.max = rows - 1
+                self.canvas.row = min(self.canvas.row, rows - 1)
+            self.canvas.data = data
         return waits
 
     def picture(self) -> Image.Image:
         """The static stand-in, at the row where the cursor is."""
-        return picture(self.seen, min(self.row.value, self.row.max), self.poses)
+        return picture(self.seen, self.row.value, self.poses)
 
     def _repr_mimebundle_(self, **options):
         return _with_png(super()._repr_mimebundle_(**options), self.picture())
