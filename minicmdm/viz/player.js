@@ -56,7 +56,9 @@ function minicmdmPlayer(root, data) {
   root.replaceChildren();
   root.tabIndex = 0;
   root.setAttribute("aria-label", "Motion player: space plays, arrow keys step, drag orbits, wheel zooms");
-  Object.assign(root.style, { font: "14px system-ui, sans-serif", color: "#1f2430", outlineOffset: "2px" });
+  Object.assign(root.style, {
+    font: "14px system-ui, sans-serif", color: "#1f2430", outlineOffset: "2px", colorScheme: "light",
+  });
   const stage = make("div", root, {
     display: "grid", gap: "10px",
     gridTemplateColumns: `repeat(${Math.min(clips.length, 4)}, minmax(0, 1fr))`,

@@ -27,7 +27,7 @@ SETTINGS = {  # no news over the page; cells out of sight are in the page too
     "@jupyterlab/apputils-extension:notification": {"fetchNews": "false", "checkForUpdates": False},
     "@jupyterlab/notebook-extension:tracker": {"windowingMode": "none"},
 }
-PATIENCE = 60  # seconds for a notebook to run, on a busy machine
+PATIENCE = 300  # seconds for a server to start or a notebook to run, on a busy machine
 
 
 def chromium_path(playwright) -> str | None:
@@ -167,14 +167,11 @@ class Notebook:
 
     def run(self) -> "Notebook":
         """Run every cell; fails at once if one fails."""
-        self.page.evaluate("() => { jupyterapp.commands.execute('notebook:run-all-cells'); }")
-        self.page.wait_for_function(
-            """() => {
-                const cells = jupyterapp.shell.currentWidget.content.widgets.filter((c) => c.model.type === "code");
-                return window.kernelProblems.length > 0 || cells.every((c) => c.model.executionCount > 0);
-            }""",
-            timeout=1000 * PATIENCE,
-        )
+        self.page.evaluate("""() => {
+            window.ended = false;
+            jupyterapp.commands.execute("notebook:run-all-cells").finally(() => { window.ended = true; });
+        }""")
+        self.page.wait_for_function("window.ended || window.kernelProblems.length > 0", timeout=1000 * PATIENCE)
         self.check()
         return self
 
@@ -221,11 +218,13 @@ def open_notebook(page, lab_server):
 
     def open_it(source) -> Notebook:
         if isinstance(source, Path):
-            path = root / source.name
-            shutil.copy(source, path)
+            path, notebook = root / source.name, json.loads(source.read_text(encoding="utf-8"))
+            for cell in notebook["cells"]:  # nothing stored may pass for something made here
+                if cell["cell_type"] == "code":
+                    cell["outputs"], cell["execution_count"] = [], None
         else:
-            path = root / f"{next(iter(source))}.ipynb"
-            path.write_text(json.dumps(as_notebook(source)), encoding="utf-8")
+            path, notebook = root / f"{next(iter(source))}.ipynb", as_notebook(source)
+        path.write_text(json.dumps(notebook), encoding="utf-8")
         return Notebook(page, address, path)
 
     yield open_it
