@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -17,8 +18,8 @@ def _normal(shape: tuple, seed: int) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def _close(a: Tensor, b: Tensor) -> bool:
-    return isinstance(a, Tensor) and a.shape == b.shape and torch.allclose(a.to(b), b, rtol=1e-8, atol=1e-10)
+def _close(a: Tensor, b: Tensor, within: float = 1e-9) -> bool:
+    return isinstance(a, Tensor) and a.shape == b.shape and torch.allclose(a.to(b), b, rtol=within, atol=within)
 
 
 def _prove_modulate(answer: Callable) -> None:
@@ -33,18 +34,19 @@ def _prove_modulate(answer: Callable) -> None:
 
 
 def _prove_rotate(answer: Callable) -> None:
+    close = partial(_close, within=1e-4)  # angles in float32 are as good an answer
     for seed, (batch, count, width) in enumerate([(1, 1, 2), (1, 2, 2), (1, 3, 4), (2, 4, 8), (2, 9, 32)]):
         x, y = (_normal((batch, count, 2, width), 20 * seed + k) for k in range(2))
         here = torch.arange(count)
         turned = answer(x, here)
         must(turned.shape == x.shape, f"The shape {tuple(x.shape)} stays.")
-        must(_close(turned[:, :1], x[:, :1]), "Position 0 is not turned at all.")
-        must(_close(turned.norm(dim=-1), x.norm(dim=-1)), "A rotation keeps every vector's length.")
+        must(close(turned[:, :1], x[:, :1]), "Position 0 is not turned at all.")
+        must(close(turned.norm(dim=-1), x.norm(dim=-1)), "A rotation keeps every vector's length.")
         dots = [(answer(x, here + far) * answer(y, here + far + 3)).sum(-1) for far in (0, 5, 40)]
         law = "Moved on together, two vectors keep their dot product: only their distance counts."
-        must(_close(dots[1], dots[0]) and _close(dots[2], dots[0]), law)
+        must(close(dots[1], dots[0]) and close(dots[2], dots[0]), law)
         law = "Channel i pairs with i + d/2 and turns by position * 10000 ** (-2i/d): (a cos - b sin, b cos + a sin)."
-        must(_close(turned, rotate(x, here)), law)
+        must(close(turned, rotate(x, here)), law)
 
 
 def cached_step(
