@@ -58,7 +58,7 @@ def test_the_losses_are_those_of_training(canvas):
     generator = torch.Generator().manual_seed(1)  # the seed of the canvas, so that the library draws the same noise
 
     def model(z_t, t, *_):
-        return canvas._denoise(z_t, t)
+        return canvas.denoise(z_t, t)
 
     with torch.no_grad():
         training = diffusion_forcing_loss(model, canvas.z, None, None, generator=generator, t=t)

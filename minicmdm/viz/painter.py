@@ -56,7 +56,7 @@ class Canvas:
         self.caption, self._pipe, self.z = caption, pipe, pipe.encode(features[None])  # (1,N,C)
         self.eps = torch.randn(self.z.shape, generator=torch.Generator().manual_seed(seed))
         self.count = self.z.shape[1]
-        self._denoise = pipe._denoiser([caption], torch.ones(1, self.count, dtype=torch.bool), 1.0, True)
+        self.denoise = pipe._denoiser([caption], torch.ones(1, self.count, dtype=torch.bool), 1.0, True)
         self.truth = self._joints(self.z)
 
     @torch.no_grad()
@@ -68,7 +68,7 @@ class Canvas:
             raise ValueError(f"expected {self.count} whole numbers from 0 to {NUM_LEVELS}, got {levels.tolist()!r:.80}")
         t = level_to_time(torch.tensor(levels[None], dtype=self.z.dtype), NUM_LEVELS)  # (1,N)
         z_t = interpolate(self.z, self.eps, t)
-        v = self._denoise(z_t, t)
+        v = self.denoise(z_t, t)
         guess = self._joints(velocity_to_data(z_t, v, t))
         loss = (v - velocity(self.z, self.eps)).square().mean(-1)[0].numpy()  # (N,)
         apart = (guess - guess[:, :1]) - (self.truth - self.truth[:, :1])  # (T,22,3)
