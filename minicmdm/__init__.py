@@ -26,7 +26,7 @@ _HOME = {  # public name -> the module it lives in
     "mirror_joints": "data.features",
     "mirror_caption": "data.features",
     "read_motion": "data.oracle",
-    "load_dataset": "data.dataset",
+    "load_dataset": "data.folders",
     "toy_dataset": "data.dataset",
     "MACVAE": "models.vae",
     "TextEncoder": "models.text",

@@ -1,4 +1,4 @@
-"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | train | evaluate | bench`.
+"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | import-bvh | train | ...`.
 
 Three habits hold for every command. What others parse (JSON, a matrix) goes to stdout; what people read while they wait
 goes to stderr. Whatever is wrong with a request is said in one line that begins "minicmdm: ", the exit code is 2, and
@@ -13,7 +13,8 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from minicmdm.commands import bench, data_make, demo, evaluate, generate, inspect, say, schedule, stream, train
+from minicmdm.commands import bench, demo, evaluate, generate, inspect, say, schedule, stream, train
+from minicmdm.data_commands import data_info, data_make, doctor, import_bvh
 
 WRONG, INTERRUPTED, READER_GONE = 2, 130, 141  # exit codes; the last two are what a shell reports for the signals
 
@@ -81,9 +82,9 @@ def _parser() -> Parser:
         sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
         sub.add_argument("--force", action="store_true", help="replace an output that exists")
 
-    sub = command("generate", generate, "Turn a sentence into a motion: an .html player, a .gif, or an .npy of joints.")
+    sub = command("generate", generate, "Turn a sentence into a motion: an .html player, .gif, .bvh or .npy of joints.")
     sub.add_argument("prompt", metavar="PROMPT", help='what to do, for example "a person walks, then waves"')
-    sub.add_argument("--out", default="motion.html", help="file to write: .html, .gif or .npy (default motion.html)")
+    sub.add_argument("--out", default="motion.html", help=".html, .gif, .bvh or .npy (default motion.html)")
     sub.add_argument("--frames", type=int, default=120, help="length at 20 frames per second, 4 to 196 (default 120)")
     sampling(sub, "fss, full or autoregressive")
 
@@ -107,11 +108,27 @@ def _parser() -> Parser:
     sub.add_argument("--kind", default="fss", help="fss, full, autoregressive, triangular or trapezoid (default fss)")
     sub.add_argument("--json", action="store_true", help="print JSON")
 
-    data = commands.add_parser("data", help="Make data sets.", description="Make data sets.", allow_abbrev=False)
+    about = "Make data sets, and look at them."
+    data = commands.add_parser("data", help=about, description=about, allow_abbrev=False)
     actions = data.add_subparsers(metavar="ACTION", required=True, dest="action")
     sub = command("make", data_make, "Write the synthesised toy world as a folder in HumanML3D's layout.", actions)
     sub.add_argument("--out", required=True, help="folder to make")
     sub.add_argument("--force", action="store_true", help="replace a data set that is there already")
+
+    sub = command("info", data_info, "A data set's card, and what is wrong with its folder, file by file.", actions)
+    sub.add_argument("folder", metavar="DIR", help="a folder in HumanML3D's layout")
+    sub.add_argument("--json", action="store_true", help="print JSON")
+
+    sub = command("import-bvh", import_bvh, "Make a data set of a folder of BVH files: 22 joints, 20 fps, captions.")
+    sub.add_argument("folder", metavar="DIR", help="a folder of .bvh files")
+    sub.add_argument("--out", required=True, help="folder to make, in HumanML3D's layout")
+    sub.add_argument("--map", help="smpl, bandai-namco, mixamo, or a JSON file (default: found by the joints' names)")
+    sub.add_argument("--up", default="y", help="the axis that points up in the files, y or z (default y)")
+    sub.add_argument("--captions", help="a CSV of name,caption (default: the words of each file's name)")
+    sub.add_argument("--force", action="store_true", help="replace a data set that is there already")
+
+    sub = command("doctor", doctor, "What is installed, how fast this machine is, and what will not work.")
+    sub.add_argument("--json", action="store_true", help="print JSON")
 
     sub = command("train", train, "Train a preset from nothing: judges, teacher, VAE, denoiser.")
     sub.add_argument("--preset", default="toy", help="toy, micro, S, M, L or XL (default toy)")

@@ -178,24 +178,6 @@ def schedule(arguments: argparse.Namespace) -> None:
     print(f"{price.calls} calls, at most {price.latents_in_flight} latents in flight")
 
 
-def data_make(arguments: argparse.Namespace) -> None:
-    """`minicmdm data make`: the toy world in HumanML3D's folder layout."""
-    out = Path(arguments.out)
-    if not arguments.out.strip() or (out.exists() and not out.is_dir()):
-        raise FileExistsError(f"--out must be a folder to make, and {arguments.out or 'nothing'} is a file or empty")
-    if not out.absolute().parent.is_dir():
-        raise FileNotFoundError(f"the folder {out.absolute().parent} for {out.name} does not exist: make it first")
-    filled = out.is_dir() and any(out.iterdir())
-    if filled and not arguments.force:
-        raise FileExistsError(f"the folder {out} is not empty and was left as it is: --force replaces a data set")
-    if filled and not (out / "programs.jsonl").is_file():  # --force deletes: only ever a data set of ours
-        raise FileExistsError(f"the folder {out} holds something else than toy data and was left as it is")
-    from minicmdm.data.dataset import make_folder
-
-    make_folder(out, force=out.is_dir())
-    say(f"wrote {out}")
-
-
 def train(arguments: argparse.Namespace) -> None:
     """`minicmdm train`: all stages, or one of them."""
     if arguments.threads < 1:

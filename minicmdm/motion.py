@@ -13,7 +13,7 @@ import numpy as np
 
 from minicmdm.files import check_output, whole_file
 
-ENDINGS = (".npy", ".gif", ".html")
+ENDINGS = (".npy", ".gif", ".html", ".bvh")
 
 
 @dataclass
@@ -34,13 +34,17 @@ class Motion:
         return len(self) / self.fps
 
     def save(self, path: str | Path, force: bool = False) -> Path:
-        """Write .npy (the joints), .gif or .html (a player) as one whole file, and return its path.
+        """Write .npy (the joints), .gif, .html (a player) or .bvh as one whole file, and return its path.
 
         Raises ValueError, FileNotFoundError, FileExistsError or PermissionError as `files.check_output` does.
         """
         path = check_output(path, ENDINGS, force)
+        ending = path.suffix.lower()
+        if ending == ".bvh":
+            from minicmdm.data.bvh_out import write_bvh
+
+            return write_bvh(path, self.joints, self.fps, force)
         with whole_file(path) as temporary:
-            ending = path.suffix.lower()
             if ending == ".npy":
                 with open(temporary, "wb") as file:
                     np.save(file, self.joints.astype(np.float32), allow_pickle=False)

@@ -216,11 +216,11 @@ def test_evaluate_prints_one_json_object(monkeypatch, tiny_run, capsys):
 
 
 def test_data_make_replaces_only_data(here, monkeypatch, capsys):
-    from minicmdm.data import dataset
+    from minicmdm.data import dataset, folders
 
     monkeypatch.setattr(dataset, "SPLITS", {"train": 3, "val": 2, "test": 2})
     assert cli.main(["data", "make", "--out", "world"]) == 0
-    assert len(dataset.load_dataset(here / "world", "train")) == 3
+    assert len(folders.load_dataset(here / "world", "train")) == 3
     assert cli.main(["data", "make", "--out", "world"]) == 2
     assert cli.main(["data", "make", "--out", "world", "--force"]) == 0
     assert capsys.readouterr().out == ""

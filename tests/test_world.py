@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from minicmdm.data import dataset, grammar
+from minicmdm.data import dataset, folders, grammar
 from minicmdm.data.programs import (
     ACTIONS,
     HELDOUT_PAIRS,
@@ -178,7 +178,7 @@ def test_test_split_holds_its_kinds():
 def test_folder_round_trip(tmp_path):
     made = dataset.toy_dataset("val", 3)
     folder = dataset.make_folder(tmp_path / "toy", {"val": 3}, progress=False)
-    read = dataset.load_dataset(folder, "val")
+    read = folders.load_dataset(folder, "val")
     for a, b in zip(made.clips, read.clips):
         np.testing.assert_array_equal(a.features, b.features)
         assert (a.captions, a.labels, a.program, a.realised) == (b.captions, b.labels, b.program, b.realised)
@@ -186,20 +186,20 @@ def test_folder_round_trip(tmp_path):
     assert read.fingerprint == dataset.world_fingerprint()
     with pytest.raises(FileExistsError, match="--force"):
         dataset.make_folder(tmp_path / "toy", {"val": 1}, progress=False)
-    assert len(dataset.load_dataset(folder, "val")) == 3
+    assert len(folders.load_dataset(folder, "val")) == 3
 
 
 def test_reader_errors_teach(tmp_path):
     with pytest.raises(FileNotFoundError, match="train.txt"):
-        dataset.load_dataset(tmp_path)
+        folders.load_dataset(tmp_path)
     folder = dataset.make_folder(tmp_path / "toy", {"val": 2}, progress=False)
     name = (folder / "val.txt").read_text().split()[0]
     np.save(folder / "new_joint_vecs" / f"{name}.npy", np.zeros((60, 100), np.float32))
     with pytest.raises(ValueError, match="263"):
-        dataset.load_dataset(folder, "val")
+        folders.load_dataset(folder, "val")
     (folder / "new_joint_vecs" / f"{name}.npy").unlink()
     with pytest.raises(FileNotFoundError, match=name):
-        dataset.load_dataset(folder, "val")
+        folders.load_dataset(folder, "val")
 
 
 def test_committed_sample_is_of_this_world():
@@ -207,7 +207,7 @@ def test_committed_sample_is_of_this_world():
     from pathlib import Path
 
     root = Path(__file__).parents[1] / "data_toy"
-    sample = dataset.load_dataset(root / "sample", "train")
+    sample = folders.load_dataset(root / "sample", "train")
     assert len(sample) == 24 and sample.fingerprint == dataset.world_fingerprint()
     assert f"`{sample.fingerprint}`" in (root / "README.md").read_text(encoding="utf-8")
     fresh = dataset.make_clip("train", 0)

@@ -8,7 +8,8 @@ place of its offset: many exporters give only the root positions, some give them
     joint_positions(bvh)   (T,J,3) in the file's own unit, by forward kinematics
     to_joints(bvh, map)    (T,22,3) in metres at 20 fps: our joints, our bone lengths, on the floor, facing +Z
 
-`bvh_out.py` goes the other way. Left stays left: nothing is mirrored on the way, as a BVH's axes are right-handed, like ours.
+`bvh_out.py` goes the other way. Left stays left: nothing is mirrored on the way, as a BVH's axes are right-handed, like
+ours.
 """
 
 from __future__ import annotations

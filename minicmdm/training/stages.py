@@ -19,7 +19,8 @@ import torch
 
 import minicmdm
 from minicmdm.config import Preset, preset
-from minicmdm.data.dataset import MotionDataset, cached_toy_folder, load_dataset, toy_dataset
+from minicmdm.data.dataset import MotionDataset, cached_toy_folder, toy_dataset
+from minicmdm.data.folders import load_dataset
 from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit

@@ -1,0 +1,263 @@
+"""Data sets on disk, in HumanML3D's layout: read, checked file by file, and written.
+
+    folder/new_joint_vecs/NAME.npy     (T, 263) features
+    folder/texts/NAME.txt              one "caption#tokens#start#end" a line, in seconds; 0 and 0 mean the whole clip
+    folder/train.txt val.txt test.txt  names of each split
+    folder/Mean.npy Std.npy            (263,)
+    folder/programs.jsonl              toy data only: the program behind each clip and a sentence for each segment
+    folder/train.json val.json ...     BABEL only: labels of stretches of each clip, several sentences a motion
+
+The same reader loads the sample in data_toy/, a generated set, imported BVH files and a real HumanML3D folder.
+A caption with a start and an end belongs to that stretch alone, so it becomes a clip of its own, as in HumanML3D's own
+loader. Nothing is ever unpickled, and no name leads out of the folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import shutil
+import tempfile
+from dataclasses import asdict
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from minicmdm.data.clips import Clip, MotionDataset, feature_statistics
+from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES, Program, Segment
+from minicmdm.data.skeleton import FPS
+
+WIDTH = 263
+SPLIT_NAMES = ("train", "val", "test")
+ADVICE = "`minicmdm data info` lists all that is wrong with a folder"
+
+
+def load_dataset(folder: str | Path, split: str = "train") -> MotionDataset:
+    """Read one split of a folder in HumanML3D's layout.
+
+    Clips under 40 frames are left out (HumanML3D's own rule) and those over 196 are cut. FileNotFoundError for a
+    missing folder, split or file and ValueError for anything that cannot be read as it should, with the file's name.
+    """
+    folder = Path(folder)
+    records = clip_records(folder, split)
+    clips = [clip for name in split_names(folder, split) for clip in read_clips(folder, name, records.get(name, {}))]
+    if not clips:
+        raise ValueError(f"{folder / split}.txt leaves no clip of at least {MIN_FRAMES} frames; {ADVICE}")
+    mean, std = read_statistics(folder) or feature_statistics([clip.features for clip in clips])
+    note = folder / "fingerprint.txt"
+    fingerprint = _text(note).strip() if note.is_file() else fingerprint_of(clips)
+    return MotionDataset(clips, mean, std, fingerprint)
+
+
+def split_names(folder: Path, split: str) -> list[str]:
+    """The names in a split's file, each a plain one. ValueError: one that leads elsewhere, or no name at all."""
+    listing = folder / f"{split}.txt"
+    if not listing.is_file():
+        raise FileNotFoundError(f"no {split}.txt in {folder}: expected a folder in HumanML3D's layout")
+    names = [line.strip() for line in _text(listing).splitlines() if line.strip()]
+    for name in names:
+        if PurePosixPath(name).name != name or "\\" in name or ":" in name or name in (".", ".."):
+            raise ValueError(f"{listing} names {name!r}: a clip's name leads to no other folder")
+    if not names:
+        raise ValueError(f"{listing} names no clip")
+    return names
+
+
+def read_clips(folder: Path, name: str, record: dict) -> list[Clip]:
+    """A motion as one clip for what is said of the whole, and one for each stretch that has captions of its own.
+
+    Those under 40 frames are left out. FileNotFoundError and ValueError as `load_dataset`.
+    """
+    features = read_features(folder / "new_joint_vecs" / f"{name}.npy", f"{name} is in a split, but its file")
+    whole, stretches = read_captions(folder / "texts" / f"{name}.txt", len(features))
+    labels = [tuple(label) for label in record.get("labels", [])]
+    for start, end, text in labels:
+        if not 0 <= start < end <= len(features) or not text.strip():
+            raise ValueError(f"{folder}: a label of {name} is no stretch of its {len(features)} frames with words")
+    clips = []
+    if whole or labels:
+        said = whole or [", then ".join(text for _, _, text in labels)]
+        labels = [(start, min(end, MAX_FRAMES), text) for start, end, text in labels if start < MAX_FRAMES]
+        asked, realised = _program(record.get("asked")), _program(record.get("realised"))
+        kind = record.get("kind", "ordinary")
+        clips.append(Clip(name, features[:MAX_FRAMES], said, labels, asked, realised, kind))
+    for number, ((start, end), captions) in enumerate(stretches.items()):
+        clips.append(Clip(f"{name}@{number}", features[start:end][:MAX_FRAMES], captions, []))
+    return [clip for clip in clips if len(clip.features) >= MIN_FRAMES]
+
+
+def read_features(path: Path, what: str = "the file") -> np.ndarray:
+    """Features (T, 263) as float32. FileNotFoundError; ValueError: pickled, cut short, another width, not finite."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{what} {path} is not there")
+    try:
+        features = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError, MemoryError, OverflowError, SyntaxError) as error:
+        raise ValueError(f"{path} is no whole .npy file of numbers ({' '.join(str(error).split())})") from error
+    if not isinstance(features, np.ndarray) or features.ndim != 2 or features.shape[1] != WIDTH or not len(features):
+        shape = getattr(features, "shape", "an archive")
+        raise ValueError(f"{path}: expected finite features of shape (T, {WIDTH}), got shape {shape}")
+    if features.dtype.kind not in "fiu" or not np.isfinite(features).all():
+        bad = np.argwhere(~np.isfinite(features))[0, 0] if features.dtype.kind == "f" else "0"
+        raise ValueError(f"{path}: expected finite features, but frame {bad} is not, or it holds {features.dtype}")
+    return features.astype(np.float32)
+
+
+def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, int], list[str]]]:
+    """What is said of the whole clip, and of stretches of it: (start, end) in frames -> captions.
+
+    FileNotFoundError; ValueError: no UTF-8, no caption at all, or a stretch that is none.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"the captions {path} are not there")
+    whole, stretches = [], {}
+    for number, row in enumerate(_text(path).splitlines(), start=1):
+        caption, _, rest = row.partition("#")
+        if not caption.strip():
+            continue
+        marks = rest.rsplit("#", 2)[-2:] if rest.count("#") >= 2 else ["0.0", "0.0"]
+        try:
+            start, end = (0.0 if math.isnan(float(mark)) else float(mark) for mark in marks)
+        except ValueError:
+            raise ValueError(f"{path}, line {number}: start and end are seconds, got {'#'.join(marks)}") from None
+        if start == end == 0:
+            whole.append(caption.strip())
+        elif 0 <= start < end:
+            stretch = int(FPS * start), min(int(FPS * end), frames)
+            if stretch[0] < stretch[1]:
+                stretches.setdefault(stretch, []).append(caption.strip())
+        else:
+            raise ValueError(f"{path}, line {number}: from {start} to {end} seconds is no stretch of a motion")
+    if not whole and not stretches:
+        raise ValueError(f"{path} holds no caption: lines like 'a person walks.#a/DET person/NOUN#0.0#0.0' go there")
+    return whole, stretches
+
+
+def babel_labels(path: Path) -> dict[str, list[tuple[int, int, str]]]:
+    """BABEL's labels of stretches: for each clip (start, end, sentence) in frames, in their order.
+
+    Reads `frame_ann.labels` with `start_t`, `end_t` in seconds and `raw_label` or `proc_label`, the layout of the
+    published train.json and val.json; where stretches overlap, the later one begins where it says. ValueError: no JSON.
+    """
+    try:
+        entries = json.loads(_text(path))
+        found = {}
+        for name, entry in entries.items():
+            labels = ((entry.get("frame_ann") or {}).get("labels")) or []
+            rows = [(int(FPS * float(x["start_t"])), int(FPS * float(x["end_t"])), x) for x in labels]
+            rows = sorted((a, b, str(x.get("proc_label") or x["raw_label"]).strip()) for a, b, x in rows if a < b)
+            found[str(entry.get("name", name))] = rows
+    except (json.JSONDecodeError, AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no BABEL file ({type(error).__name__}: {error})") from error
+    return found
+
+
+def write_folder(sets: dict[str, MotionDataset], out: str | Path, force: bool = False) -> Path:
+    """Write splits into a folder in HumanML3D's layout; it appears whole or not at all.
+
+    FileExistsError when the folder exists and `force` is false, FileNotFoundError when its parent does not.
+    """
+    out = check_new_folder(out, force)
+    scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.resolve().parent))
+    try:
+        os.chmod(scratch, 0o755)
+        for name in ("new_joint_vecs", "texts"):
+            (scratch / name).mkdir()
+        with open(scratch / "programs.jsonl", "w", encoding="utf-8", newline="\n") as lines:
+            for split, data in sets.items():
+                _write(scratch / f"{split}.txt", "".join(f"{clip.name}\n" for clip in data.clips))
+                for clip in data.clips:
+                    np.save(scratch / "new_joint_vecs" / f"{clip.name}.npy", clip.features, allow_pickle=False)
+                    rows = "".join(f"{text}#{_tokens(text)}#0.0#0.0\n" for text in clip.captions)
+                    _write(scratch / "texts" / f"{clip.name}.txt", rows)
+                    if clip.program is not None:
+                        record = {"name": clip.name, "kind": clip.kind, "asked": _plain(clip.program)}
+                        record |= {"realised": _plain(clip.realised), "labels": clip.labels}
+                        lines.write(json.dumps(record) + "\n")
+        if not (scratch / "programs.jsonl").stat().st_size:
+            (scratch / "programs.jsonl").unlink()
+        first = sets.get("train") or next(iter(sets.values()))
+        np.save(scratch / "Mean.npy", first.mean)
+        np.save(scratch / "Std.npy", first.std)
+        _write(scratch / "fingerprint.txt", first.fingerprint + "\n")
+        if out.exists() and force:
+            shutil.rmtree(out)
+        try:
+            scratch.rename(out)
+        except OSError as error:
+            if out.is_dir():  # somebody else made it meanwhile
+                raise FileExistsError(f"{out} exists; give --force to replace it") from error
+            raise
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return out
+
+
+def check_new_folder(out: str | Path, force: bool = False) -> Path:
+    """The folder as a Path if it can be made. FileExistsError, FileNotFoundError as `write_folder`."""
+    out = Path(out)
+    if out.exists() and not force:
+        raise FileExistsError(f"{out} exists; give --force to replace it")
+    if not out.resolve().parent.is_dir():
+        raise FileNotFoundError(f"the folder {out.resolve().parent} does not exist")
+    return out
+
+
+def clip_records(folder: Path, split: str) -> dict[str, dict]:
+    """What is known of clips beside features and captions: programs of the toy world, or BABEL's labels."""
+    if (path := folder / "programs.jsonl").is_file():
+        try:
+            return {record["name"]: record for record in map(json.loads, _text(path).splitlines())}
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ValueError(f"{path} is no list of programs ({error})") from error
+    if (path := folder / f"{split}.json").is_file():
+        return {name: {"labels": labels} for name, labels in babel_labels(path).items()}
+    return {}
+
+
+def read_statistics(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean.npy and Std.npy (263,), or None where one is missing. ValueError: another width, not finite, no spread."""
+    paths = [folder / "Mean.npy", folder / "Std.npy"]
+    if not all(path.is_file() for path in paths):
+        return None
+    mean, std = (np.load(path, allow_pickle=False) for path in paths)
+    for path, value in zip(paths, (mean, std)):
+        if value.shape != (WIDTH,) or value.dtype.kind != "f" or not np.isfinite(value).all():
+            raise ValueError(f"{path}: expected {WIDTH} finite numbers, got {value.dtype} of shape {value.shape}")
+    if (std <= 0).any():
+        raise ValueError(f"{paths[1]}: every std is above 0, and that of feature {int(std.argmin())} is {std.min()}")
+    return mean.astype(np.float32), std.astype(np.float32)
+
+
+def fingerprint_of(clips: list[Clip]) -> str:
+    """A hash of all features and words, for a folder that brings none."""
+    digest = hashlib.sha256()
+    for clip in clips:
+        digest.update(clip.features.tobytes() + "\n".join([clip.name, *clip.captions]).encode())
+    return digest.hexdigest()[:16]
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text (byte {error.start}): save it as UTF-8") from error
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def _tokens(text: str) -> str:
+    """HumanML3D stores each caption's words with a part of speech; ours is not tagged."""
+    return " ".join(f"{word}/OTHER" for word in text.replace(",", "").replace(".", "").split())
+
+
+def _plain(program: Program | None) -> list[dict] | None:
+    return None if program is None else [asdict(segment) for segment in program]
+
+
+def _program(records: list[dict] | None) -> Program | None:
+    return None if records is None else tuple(Segment(**record) for record in records)

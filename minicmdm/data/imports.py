@@ -1,0 +1,182 @@
+"""A folder of BVH files becomes a data set, and a data set's folder is told file by file what is wrong with it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from minicmdm.data.bvh import MAPS, Place, read_bvh, to_joints
+from minicmdm.data.clips import Clip, MotionDataset, feature_statistics
+from minicmdm.data.features import joints_to_features
+from minicmdm.data.folders import (
+    SPLIT_NAMES,
+    check_new_folder,
+    clip_records,
+    fingerprint_of,
+    read_captions,
+    read_clips,
+    read_features,
+    read_statistics,
+    split_names,
+    write_folder,
+)
+from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES
+from minicmdm.data.skeleton import FPS
+
+EVERY = 10  # one clip in ten goes to val and one to test; with fewer than ten clips all splits are the same
+
+
+def import_bvh(
+    folder: str | Path,
+    out: str | Path,
+    *,
+    joint_map: str | Path | None = None,
+    up: str = "y",
+    captions: str | Path | None = None,
+    force: bool = False,
+    say: Callable[[str], None] = lambda line: None,
+) -> Path:
+    """Read every .bvh of a folder and write a data set in HumanML3D's layout, clips of every length.
+
+    `joint_map` is one of `bvh.MAPS`, a JSON file of one's own (our 22 names -> theirs), or found by the joints' names.
+    `captions` is a CSV of name,caption (several rows a name are several captions); without it the words of the file
+    name are the caption. FileNotFoundError, FileExistsError, or ValueError with the file that cannot be read.
+    """
+    folder, out = Path(folder), check_new_folder(out, force)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}: a folder of .bvh files was expected")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".bvh")
+    if not paths:
+        raise FileNotFoundError(f"the folder {folder} holds no .bvh file")
+    places = None if joint_map is None else load_map(joint_map)
+    told = None if captions is None else read_csv(captions)
+    if told is not None and (silent := [path.stem for path in paths if path.stem not in told]):
+        raise ValueError(f"{captions} has no caption for {silent[0]} ({len(silent)} of {len(paths)} files)")
+    clips = []
+    for path in paths:
+        try:
+            joints = to_joints(read_bvh(path), places, up)
+            features = joints_to_features(joints).astype(np.float32)  # (T,263)
+        except ValueError as error:
+            raise ValueError(str(error) if str(path) in str(error) else f"{path}: {error}") from error
+        clips.append(Clip(path.stem, features, [words_of(path.stem)] if told is None else told[path.stem], []))
+    mean, std = feature_statistics([clip.features for clip in clips])
+    mark = fingerprint_of(clips)
+    splits = split_clips(clips)
+    short = sum(len(clip.features) < MIN_FRAMES for clip in clips)
+    write_folder({name: MotionDataset(some, mean, std, mark) for name, some in splits.items()}, out, force)
+    note = f", of which the loader leaves out {short} under {MIN_FRAMES} frames" if short else ""
+    say(f"{len(clips)} clips, {sum(len(clip.features) for clip in clips) / FPS:.0f} s{note}")
+    return out
+
+
+def split_clips(clips: list[Clip]) -> dict[str, list[Clip]]:
+    """Train, val and test: of every ten clips eight, one and one; all three the same where there are too few."""
+    if len(clips) < EVERY:
+        return dict.fromkeys(SPLIT_NAMES, clips)
+    kind = [{EVERY - 2: "val", EVERY - 1: "test"}.get(number % EVERY, "train") for number in range(len(clips))]
+    return {name: [clip for clip, own in zip(clips, kind) if own == name] for name in SPLIT_NAMES}
+
+
+def words_of(name: str) -> str:
+    """A file's name as a caption: "dataset-2_wave-left-hand_normal_001" -> "a person: wave left hand normal"."""
+    words = re.findall(r"[^\W\d_]+", re.sub(r"^dataset[-_ ]?\d+", "", name, flags=re.IGNORECASE))
+    return f"a person: {' '.join(words).lower()}" if words else "a person moves"
+
+
+def load_map(source: str | Path) -> dict[str, Place]:
+    """A map by its name, or from a JSON file: our names -> a name, or [a, b, share]. FileNotFoundError, ValueError."""
+    if str(source) in MAPS:
+        return MAPS[str(source)]
+    path = Path(source)
+    if not path.is_file():
+        raise FileNotFoundError(f"no joint map {source}: expected one of {', '.join(MAPS)}, or a JSON file")
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        return {
+            name: where if isinstance(where, str) else (str(where[0]), str(where[1]), float(where[2]))
+            for name, where in entries.items()
+        }
+    except (ValueError, AttributeError, TypeError, IndexError, KeyError) as error:
+        raise ValueError(f"{path} is no joint map: expected our names -> a name or [a, b, share] ({error})") from error
+
+
+def read_csv(path: str | Path) -> dict[str, list[str]]:
+    """Captions by clip from a CSV with the columns name and caption. FileNotFoundError, ValueError."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no file {path}: a CSV with the columns name and caption was expected")
+    try:
+        with open(path, encoding="utf-8-sig", newline="") as file:
+            reader = csv.DictReader(file)
+            if not {"name", "caption"} <= set(reader.fieldnames or ()):
+                raise ValueError(f"{path} has the columns {reader.fieldnames}, and name and caption were expected")
+            found: dict[str, list[str]] = {}
+            for number, row in enumerate(reader, start=2):
+                name, caption = (row[key] or "" for key in ("name", "caption"))
+                if not name.strip() or not caption.strip():
+                    raise ValueError(f"{path}, line {number}: a name and a caption were expected")
+                found.setdefault(name.strip().removesuffix(".bvh"), []).append(caption.strip().replace("#", " "))
+            return found
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text (byte {error.start}): save it as UTF-8") from error
+    except csv.Error as error:
+        raise ValueError(f"{path} is no CSV ({error})") from error
+
+
+def inspect_folder(folder: str | Path) -> tuple[dict[str, object], list[str]]:
+    """A data set's card, and what is wrong with it, file by file. FileNotFoundError: no folder, or no split in it."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {folder}: expected a data set in HumanML3D's layout")
+    splits = [name for name in SPLIT_NAMES if (folder / f"{name}.txt").is_file()]
+    if not splits:
+        raise FileNotFoundError(f"{folder} holds none of {', '.join(f'{name}.txt' for name in SPLIT_NAMES)}")
+    card: dict[str, object] = {"folder": str(folder)}
+    wrong: list[str] = []
+    seen: dict[str, str] = {}
+    frames, captions, words = [], 0, set()
+
+    def attempt(work: Callable):
+        try:
+            return work()
+        except (ValueError, OSError) as error:
+            wrong.append(" ".join(str(error).split()))
+
+    for split in splits:
+        names = attempt(lambda: split_names(folder, split)) or []  # noqa: B023
+        card[split] = len(names)
+        records = attempt(lambda: clip_records(folder, split)) or {}  # noqa: B023
+        for name in names:
+            if name in seen:
+                wrong.append(f"{split}.txt names {name}, which {seen[name]}.txt has named already")
+                continue
+            seen[name] = split
+            path = folder / "new_joint_vecs" / f"{name}.npy"
+            features = attempt(lambda: read_features(path, f"{name} is in {split}.txt, but its file"))  # noqa: B023
+            if features is None:
+                continue
+            frames.append(len(features))
+            if len(features) < MIN_FRAMES:
+                wrong.append(f"{path} has {len(features)} frames: those under {MIN_FRAMES} are left out")
+            elif len(features) > MAX_FRAMES:
+                wrong.append(f"{path} has {len(features)} frames: what is over {MAX_FRAMES} is cut")
+            said = attempt(lambda: read_captions(folder / "texts" / f"{name}.txt", len(features)))  # noqa: B023
+            if said is not None:
+                attempt(lambda: read_clips(folder, name, records.get(name, {})))  # noqa: B023
+                sentences = [*said[0], *(text for some in said[1].values() for text in some)]
+                captions += len(sentences)
+                words |= {word for text in sentences for word in re.findall(r"[^\W\d_]+", text.lower())}
+    attempt(lambda: read_statistics(folder))
+    for name in ("Mean.npy", "Std.npy"):
+        if not (folder / name).is_file():
+            wrong.append(f"{folder / name} is not there: mean and std of the training clips are used")
+    if frames:
+        card |= {"seconds": round(sum(frames) / FPS, 1), "frames_least": min(frames), "frames_most": max(frames)}
+    card |= {"captions": captions, "words": len(words), "problems": len(wrong)}
+    return card, wrong
