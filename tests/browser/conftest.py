@@ -213,10 +213,13 @@ class Notebook:
 
 @pytest.fixture
 def open_notebook(page, lab_server):
-    """A function that puts a notebook (a path, or sources {id: code}) into JupyterLab and opens it."""
+    """A function that puts a notebook (a path, or sources {id: code}) into JupyterLab and opens it.
+
+    `last` leaves out what comes after that cell.
+    """
     address, root = lab_server
 
-    def open_it(source) -> Notebook:
+    def open_it(source, last: str | None = None) -> Notebook:
         if isinstance(source, Path):
             path, notebook = root / source.name, json.loads(source.read_text(encoding="utf-8"))
             for cell in notebook["cells"]:  # nothing stored may pass for something made here
@@ -224,6 +227,8 @@ def open_notebook(page, lab_server):
                     cell["outputs"], cell["execution_count"] = [], None
         else:
             path, notebook = root / f"{next(iter(source))}.ipynb", as_notebook(source)
+        if last is not None:
+            del notebook["cells"][[cell["id"] for cell in notebook["cells"]].index(last) + 1 :]
         path.write_text(json.dumps(notebook), encoding="utf-8")
         return Notebook(page, address, path)
 

@@ -115,7 +115,7 @@ def test_the_harness_hears_a_cell_that_fails_and_a_request_that_leaves(open_note
 
 
 def test_06_a_level_painted_by_hand_changes_motion_guess_and_loss(open_notebook, shots):
-    notebook = open_notebook(NOTEBOOKS / "06_diffusion_forcing.ipynb").run()
+    notebook = open_notebook(NOTEBOOKS / "06_diffusion_forcing.ipynb", last="painter").run()  # what follows trains
     page = notebook.page
     root = page.locator(".painter")
     root.scroll_into_view_if_needed()
