@@ -96,7 +96,7 @@ export default {
       } else if (message.kind === "heard") {
         root.dataset.heard = message.first;
         const wait = (Math.max(message.first - now, 0) / plan.fps).toFixed(1);
-        say(`“${message.prompt}” is heard in ${wait} s, from frame ${message.first} on`);
+        say(`sent at frame ${Math.floor(now)}, heard ${wait} s later, from frame ${message.first} on`);
       } else if (message.kind === "problem") {
         say(message.text, true);
         if (message.fatal) stop();
