@@ -24,10 +24,9 @@ def _prove_noise(answer: Callable) -> None:
         luck, top = torch.Generator().manual_seed(size), 4 + 3 * size
         z, eps = torch.randn(2, batch, latents, channels, generator=luck).double()
         level = torch.randint(top + 1, (batch, latents), generator=luck)
-        must(torch.equal(answer(z, eps, 0 * level, top), z), "At level 0 a latent is clean.")
-        must(
-            torch.equal(answer(z, eps, 0 * level + top, top), eps), f"At level K = {top} a latent is nothing but noise."
-        )
+        must(torch.allclose(answer(z, eps, 0 * level, top), z, atol=1e-6), "At level 0 a latent is clean.")
+        law = f"At level K = {top} a latent is nothing but noise."
+        must(torch.allclose(answer(z, eps, 0 * level + top, top), eps, atol=1e-6), law)
         noisy = answer(z, eps, level, top)
         for b in range(batch):
             for n in range(latents):
