@@ -109,6 +109,7 @@ class TrainConfig:
     time_power: float = 1.0  # random times are u ** time_power: 1 is the paper's, more draws noisy latents more often
     ema: float = 0.9999
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
+    word_drop: float = 0.0  # how often a word of a sentence is hidden (ours): each has to be understood by itself
     # all
     betas: tuple[float, float] = (0.9, 0.99)
     weight_decay: float = 1e-5
@@ -206,6 +207,7 @@ PRESETS = {
             dit_lr=1.5e-3,
             dit_warmup=300,
             dit_muon=1e-2,
+            word_drop=0.15,
             ema=0.999,
             weight_decay=0.0,
         ),

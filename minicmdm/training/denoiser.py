@@ -12,7 +12,7 @@ from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
 from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase, draw_times
 from minicmdm.models.dit import CausalDiT
-from minicmdm.models.text import TextEncoder, WordCache
+from minicmdm.models.text import TextEncoder, WordCache, Words
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, said, words_per_latent
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
@@ -37,14 +37,15 @@ def train_dit(
     models = nn.ModuleDict({"dit": dit})
 
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        return denoising_loss(models["dit"], words, latents, plan, cfg.dit_batch, cfg.text_drop, generator), {}
+        drops = cfg.text_drop, cfg.word_drop
+        return denoising_loss(models["dit"], words, latents, plan, cfg.dit_batch, drops, generator), {}
 
     @torch.no_grad()
     def validate(ema: nn.ModuleDict) -> dict[str, float]:
         losses = []
         for key in range(4):  # the same batches and the same noise every time
             generator = torch.Generator().manual_seed(key)
-            losses.append(denoising_loss(ema["dit"], words, val_latents, plan, 64, 0.0, generator).item())
+            losses.append(denoising_loss(ema["dit"], words, val_latents, plan, 64, (0.0, 0.0), generator).item())
         return {"val_loss": float(np.mean(losses))}
 
     config = loop_config(plan, cfg.dit_steps, cfg.dit_lr, cfg.dit_warmup, cfg.dit_muon)
@@ -62,11 +63,14 @@ def denoising_loss(
     latents: LatentSet,
     plan: Preset,
     count: int,
-    drop: float,
+    drops: tuple[float, float],
     generator: torch.Generator,
 ) -> Tensor:
-    """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent."""
-    batch = draw_batch(latents, count, drop, generator)
+    """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent.
+
+    `drops` says how often a whole sentence is dropped, and how often a single word.
+    """
+    batch = draw_batch(latents, count, drops[0], generator)
     block_size, committed, visible = plan.dit.block_size, None, batch.valid
     if plan.train.levels == "staircase":
         t, committed, visible = draw_staircase(batch.valid, block_size, generator)
@@ -75,7 +79,7 @@ def denoising_loss(
         if plan.dit.attention == "window":
             committed, visible = draw_boundary(batch.valid, block_size, generator)
     with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
-        read = dit.read(words.encode(batch.sentences))  # each different sentence once: (U,S1,E), (U,S1)
+        read = dit.read(hide_words(words.encode(batch.sentences), drops[1], generator))  # each sentence once: (U,S1,E)
         seen, mask = words_per_latent(read, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
         return diffusion_forcing_loss(
             dit,
@@ -89,3 +93,17 @@ def denoising_loss(
             committed=committed,
             t=t,
         )
+
+
+def hide_words(words: Words, share: float, generator: torch.Generator) -> Words:
+    """Hide a share of the words of each sentence (U,S) from the denoiser, but never its marks [CLS] and [SEP].
+
+    Captions say most things twice ("sits down on a chair"), and a model that always sees all of a phrase learns the
+    phrase. One that has to do without some of its words learns what each of them means, and understands new phrases.
+    """
+    if share == 0:
+        return words
+    place = torch.arange(words.mask.shape[1])
+    inner = (place > 0) & (place < words.mask.sum(1, keepdim=True) - 1)  # (U,S)
+    hidden = inner & (torch.rand(words.mask.shape, generator=generator) < share)
+    return Words(words.embeddings, words.mask & ~hidden)

@@ -58,5 +58,9 @@ def orthogonal(matrices: Tensor) -> Tensor:
 
 
 def inner_matrices(models: nn.Module) -> list[Tensor]:
-    """The weights Muon is for: matrices in the repeated blocks of a transformer, not what embeds or reads out."""
-    return [w for name, w in models.named_parameters() if w.ndim == 2 and "blocks." in name and w.requires_grad]
+    """The weights Muon is for: matrices in the repeated blocks of a transformer, not what embeds or reads out.
+
+    The denoiser's word blocks are left out: with Muon they learnt the training captions' phrases by heart.
+    """
+    named = models.named_parameters()
+    return [w for name, w in named if w.ndim == 2 and "blocks" in name.split(".") and w.requires_grad]
