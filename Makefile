@@ -37,7 +37,7 @@ test: $(VENV)/.dev  ## lint, tests and notebooks
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pytest -n 2 --dist loadgroup -rs
-	MINICMDM_FAST=1 $(BIN)/pytest --nbmake notebooks --nbmake-timeout=90
+	MINICMDM_FAST=1 $(BIN)/pytest -n 2 --nbmake notebooks --nbmake-timeout=90
 
 quick: $(VENV)/.dev  ## tests alone, without the browser
 	$(BIN)/pytest -n 2 --dist loadgroup -m "not browser"
