@@ -43,7 +43,9 @@ SECTIONS = [
     r"^## Three changes to try",
     r"^## Next",
 ]
-WIDGET = re.compile(r"\bexplore\(|SkeletonPlayer\(|MotionMaker\(|(?<!plt)\.show\(\)")
+WIDGET = re.compile(
+    r"\bexplore\(|SkeletonPlayer\(|MotionMaker\(|MatrixExplorer\(|NoisePainter\(|LiveStream\(|(?<!plt)\.show\(\)"
+)
 FIGURE = re.compile(r"pose_strip\(|strips\(|plt\.show\(|imshow\(|plt\.subplots\(")
 
 
