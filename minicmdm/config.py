@@ -202,12 +202,10 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=5_000,
+            dit_steps=6_500,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
-            dit_muon=1e-2,
-            word_drop=0.15,
             ema=0.999,
             weight_decay=0.0,
         ),

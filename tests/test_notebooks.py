@@ -46,7 +46,7 @@ SECTIONS = [
 WIDGET = re.compile(
     r"\bexplore\(|SkeletonPlayer\(|MotionMaker\(|MatrixExplorer\(|NoisePainter\(|LiveStream\(|(?<!plt)\.show\(\)"
 )
-FIGURE = re.compile(r"pose_strip\(|strips\(|plt\.show\(|imshow\(|plt\.subplots\(")
+FIGURE = re.compile(r"\bpicture\(|pose_strip\(|strips\(|plt\.show\(|imshow\(|plt\.subplots\(")
 
 
 def source(cell):
