@@ -47,9 +47,9 @@ def _prove_first_moved(answer: Callable) -> None:
             change = vae.decode(vae.encode(edited)[0]) - vae.decode(vae.encode(clip)[0])  # (1,T,263)
         first = int((change.abs().amax(-1)[0] > 1e-9).nonzero()[0])
         guess = answer(frame)
-        law = f"In a random VAE an edit of frame {frame} of {frames} moves the output from frame "
-        must(guess <= first, law + "earlier on than that: a latent stands for a whole group of frames.")
-        must(guess >= first, law + "later on: nothing before the edited frame's own group moves, that is causality.")
+        law = f"In a random VAE an edit of frame {frame} of {frames} "
+        must(guess <= first, law + f"moves output before frame {guess}, too: a latent stands for a group of frames.")
+        must(guess >= first, law + f"leaves output frame {guess} alone: causality guards all before the edited group.")
 
 
 EXERCISES = (
