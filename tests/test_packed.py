@@ -35,10 +35,10 @@ def test_a_packed_layer_is_the_layer(dtype, tolerance, rows, bias):
 def test_the_twin_is_packed_under_its_blocks_and_shares_all_else():
     dit = random_model(TINY)
     before = {name: value.clone() for name, value in dit.state_dict().items()}
-    twin = packed(dit, 6)
+    twin = packed(dit, 6, smallest=1)
     kinds = [type(layer) for layer in twin.blocks.modules()]
     assert PackedLinear in kinds and nn.Linear not in kinds
-    assert not any(isinstance(layer, PackedLinear) for layer in dit.modules())
+    assert not any(isinstance(layer, PackedLinear) for layer in [*dit.modules(), *packed(dit, 6).modules()])
     assert twin.out.weight is dit.out.weight and twin.embed_words.weight is dit.embed_words.weight
     assert all(torch.equal(before[name], value) for name, value in dit.state_dict().items())
     z, t, words = torch.randn(2, 5, 4), torch.rand(2, 5), torch.randn(2, 3, 16)

@@ -11,6 +11,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
+SMALLEST = 65_536  # numbers in a matrix: smaller ones stay in the cache, and for them packing costs more than it saves
 _DTYPES = (torch.float32, torch.bfloat16)
 
 
@@ -37,8 +38,8 @@ def can_pack(weight: Tensor) -> bool:
     return all(hasattr(torch.ops.mkldnn, name) for name in ("_reorder_linear_weight", "_linear_pointwise"))
 
 
-def packed(model: nn.Module, rows: int, among: str = "blocks") -> nn.Module:
-    """A twin of `model` whose linear layers under the child `among` are packed; everything else is shared with it.
+def packed(model: nn.Module, rows: int, among: str = "blocks", smallest: int = SMALLEST) -> nn.Module:
+    """A twin of `model` whose large linear layers under the child `among` are packed; all else is shared with it.
 
     The twin keeps the weights of now: make a new one when the model has learnt. Where packing is not to be had, the
     model itself comes back.
@@ -48,6 +49,6 @@ def packed(model: nn.Module, rows: int, among: str = "blocks") -> nn.Module:
     twin = copy.deepcopy(model, {id(weight): weight for weight in model.parameters()})  # new modules, old weights
     for layer in list(twin.get_submodule(among).modules()):
         for name, child in layer.named_children():
-            if isinstance(child, nn.Linear):
+            if isinstance(child, nn.Linear) and child.weight.numel() >= smallest:
                 setattr(layer, name, PackedLinear(child, rows))
     return twin
