@@ -167,7 +167,7 @@ def transition_distance(joints: np.ndarray, boundaries: Sequence[int]) -> float:
     """How far (cm) the pose of joints (T,22,3) jumps into each boundary frame, over joints and boundaries.
 
     The jump is from k - 1 to k for each boundary k in 1..T-1, seen from the pelvis and the body's heading, so walking
-    and turning cost nothing. (STMC's script takes each joint's own x off it instead, for generated motions.) Source: TEACH.
+    and turning cost nothing. (STMC's script takes each joint's own x off it, for generated motions.) Source: TEACH.
     """
     joints = _array("joints", joints, "T >= 2", NUM_JOINTS, 3)
     cuts = np.unique(np.asarray(boundaries))
