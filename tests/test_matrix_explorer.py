@@ -6,6 +6,7 @@ import io
 import re
 import shutil
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -212,6 +213,12 @@ def test_a_film_that_comes_too_late_is_not_shown(explorer):
     assert explorer.canvas.data["rows"] == 79 == len(explorer.poses) == len(explorer.seen.matrix)
 
 
+def run(work):
+    """Run a coroutine in a thread of its own: in this one a browser's loop may be running."""
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(asyncio.run, work).result()
+
+
 def test_a_new_schedule_shows_at_once_and_its_film_when_the_controls_rest(monkeypatch):
     monkeypatch.setattr(mx, "PAUSE", 0.02)
     made = []
@@ -227,9 +234,9 @@ def test_a_new_schedule_shows_at_once_and_its_film_when_the_controls_rest(monkey
         assert made == [] and explorer.canvas.data["poses"] == b""
         await asyncio.sleep(0.2)
 
-    asyncio.run(drag())
+    run(drag())
     assert seen == [(57, True), (68, True), (79, True), (79, False)] and made == [79]
-    asyncio.run(drag_back(explorer))
+    run(drag_back(explorer))
     assert seen[4:] == [(68, True), (79, False)]  # a film that is known comes with its schedule
 
 

@@ -160,7 +160,10 @@ class Notebook:
                 if (message.header.msg_type === "error") {
                     window.kernelProblems.push(`${message.content.ename}: ${message.content.evalue}`);
                 } else if (message.header.msg_type === "stream" && message.content.name === "stderr") {
-                    window.kernelProblems.push(message.content.text);
+                    // JupyterLab asks a fresh kernel for widgets of the page before; that is nobody's fault.
+                    if (!message.content.text.startsWith("No such comm")) {
+                        window.kernelProblems.push(message.content.text);
+                    }
                 }
             });
         }""")
