@@ -41,10 +41,13 @@ def can_pack(weight: Tensor) -> bool:
 def packed(model: nn.Module, rows: int, among: str = "blocks", smallest: int = SMALLEST) -> nn.Module:
     """A twin of `model` whose large linear layers under the child `among` are packed; all else is shared with it.
 
-    The twin keeps the weights of now: make a new one when the model has learnt. Where packing is not to be had, the
-    model itself comes back.
+    The twin keeps the weights of now: make a new one when the model has learnt. Where there is nothing to pack, or no
+    way to, the model itself comes back.
     """
-    if not can_pack(next(model.parameters())):
+    large = [
+        m for m in model.get_submodule(among).modules() if isinstance(m, nn.Linear) and m.weight.numel() >= smallest
+    ]
+    if not large or not can_pack(large[0].weight):
         return model
     twin = copy.deepcopy(model, {id(weight): weight for weight in model.parameters()})  # new modules, old weights
     for layer in list(twin.get_submodule(among).modules()):
