@@ -244,3 +244,9 @@ def test_heading_survives_the_journey(tmp_path):
     a, b = (load_dataset(tmp_path / f"set-{name}").clips[0].features for name in "ab")
     np.testing.assert_allclose(a, b, atol=2e-3)
     assert joints_to_features(joints).shape[1] == a.shape[1]
+
+
+def test_doctor_tells_what_is_here(capsys):
+    assert cli.main(["doctor", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["torch"] != "missing" and facts["matmul_gflops"] > 0 and isinstance(facts["wrong"], list)

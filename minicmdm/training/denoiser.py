@@ -99,7 +99,7 @@ def hide_words(words: Words, share: float, generator: torch.Generator) -> Words:
     """Hide a share of the words of each sentence (U,S) from the denoiser, but never its marks [CLS] and [SEP].
 
     Captions say most things twice ("sits down on a chair"), and a model that always sees all of a phrase learns the
-    phrase. One that has to do without some of its words learns what each of them means, and understands new phrases.
+    phrase. One that has to do without some of its words should learn what each of them means (README: one seed).
     """
     if share == 0:
         return words
