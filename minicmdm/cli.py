@@ -144,6 +144,8 @@ def _parser() -> Parser:
     sub.add_argument(
         "--threads", type=int, default=1, help="CPU threads; on one, a run repeats bit for bit (default 1)"
     )
+    sub.add_argument("--device", default="cpu", help="cpu, cuda, mps ... (default cpu)")
+    sub.add_argument("--accumulate", type=int, help="batches whose gradients make one step; processes share them")
 
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")
     sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")

@@ -184,6 +184,8 @@ def train(arguments: argparse.Namespace) -> None:
         raise ValueError(f"--threads must be at least 1, and {arguments.threads} came")
     if arguments.seed is not None and arguments.seed < 0:
         raise ValueError(f"--seed must not be negative, and {arguments.seed} came")
+    if arguments.accumulate is not None and arguments.accumulate < 1:
+        raise ValueError(f"--accumulate must be at least 1, and {arguments.accumulate} came")
     if not arguments.out.strip():
         raise ValueError("--out is empty: give a folder for the checkpoint")
     import torch
@@ -204,6 +206,8 @@ def train(arguments: argparse.Namespace) -> None:
         data=arguments.data,
         seed=arguments.seed,
         compile=arguments.compile,
+        accumulate=arguments.accumulate,
+        device=arguments.device,
         command=" ".join(["minicmdm train", *flags]),
         say=say,
     )

@@ -80,6 +80,7 @@ class TrainConfig:
     seed: int = 0
     bfloat16: bool = False  # autocast the forward pass; the weights and the optimiser stay float32
     compile: bool = False  # torch.compile the denoiser's blocks while they train; needs a C++ compiler
+    accumulate: int = 1  # micro-batches a step, shared by all processes; every batch below is one of them
     # stage 1: the evaluators
     evaluator_steps: int = 20_000
     evaluator_batch: int = 128

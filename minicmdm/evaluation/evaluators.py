@@ -32,6 +32,7 @@ from minicmdm.models.tmr import MAX_SCALE, contrastive_loss
 from minicmdm.training.batches import POOL
 from minicmdm.training.checkpoints import checksum, load_tensors, load_weights, save_tensors
 from minicmdm.training.loop import LoopConfig, LoopResult, fit, step_key
+from minicmdm.training.team import ALONE, Team
 
 FORMAT = "minicmdm-bench-1"
 ESSENTIAL = 67  # root and joint positions, the first of the 263: all that a skeleton is drawn from (MARDM)
@@ -195,8 +196,10 @@ def train_evaluator(
     batch: int,
     lr: float,
     seed: int,
+    accumulate: int = 1,
     resume: bool = False,
     progress: bool = True,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Learn which sentence belongs to which motion; `ema["evaluator"]` of the result is the judge.
 
@@ -214,8 +217,10 @@ def train_evaluator(
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         clips, texts, misses, whose = draw_pairs(train_set, batch, generator)
         said = [clip.program or text for clip, text in zip(clips, texts)]
-        same = torch.tensor([[a == b for b in said] for a in said])  # not wrong answers, if not right ones
-        motion, text = judge.motion(*_stack([clip.features for clip in clips])), judge.sentences(texts + misses)
+        # Not wrong answers, if not right ones.
+        same = torch.tensor([[a == b for b in said] for a in said], device=team.device)
+        motion = judge.motion(*_stack([clip.features for clip in clips], team.device))
+        text = judge.sentences(texts + misses)
         closeness = judge.similarity(motion, text)  # (B,B+M)
         right, wrong = closeness.diagonal()[whose], closeness[whose, len(clips) + torch.arange(len(whose))]  # (M,) each
         value = contrastive_loss(closeness[:, : len(clips)], same) + F.softplus(wrong - right).sum() / len(clips)
@@ -226,24 +231,34 @@ def train_evaluator(
         found = r_precision(*pairs, pool=min(32, len(val_set)))
         return dict(zip(("val_r_at_1", "val_r_at_2", "val_r_at_3"), found.tolist()))
 
-    loop = LoopConfig(steps, lr, warmup=steps // 15, weight_decay=0.01, ema=0.99, seed=own)
+    loop = LoopConfig(steps, lr, warmup=steps // 15, weight_decay=0.01, ema=0.99, accumulate=accumulate, seed=own)
     identity = asdict(cfg) | {"steps": steps, "batch": batch, "lr": lr, "seed": seed, "data": train_set.fingerprint}
     name, models = f"evaluator_{cfg.kind}_{cfg.dims}", nn.ModuleDict({"evaluator": judge})
-    return fit(name, models, loss, validate, loop, Path(out), identity=identity, resume=resume, progress=progress)
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    return fit(name, models, loss, validate, loop, Path(out), **how)
 
 
 def train_bench(
-    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+    plan: Preset,
+    train_set: MotionDataset,
+    val_set: MotionDataset,
+    out: Path,
+    *,
+    resume: bool,
+    progress: bool,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Train the three judges of a preset one after the other and write them into `out`/evaluator."""
     cfg, judges, metrics, seconds = plan.train, nn.ModuleDict(), {}, 0.0
     sizes = {"steps": cfg.evaluator_steps, "batch": cfg.evaluator_batch, "lr": cfg.evaluator_lr, "seed": cfg.seed}
+    how = {"accumulate": cfg.accumulate, "resume": resume, "progress": progress, "team": team}
     for name, shape in BENCH.items():
-        result = train_evaluator(shape, train_set, val_set, out, **sizes, resume=resume, progress=progress)
+        result = train_evaluator(shape, train_set, val_set, out, **sizes, **how)
         judges[name], seconds = result.ema["evaluator"], seconds + result.seconds
         metrics |= {f"{name}_{key}": value for key, value in result.metrics.items()}
     facts = {**sizes, "data": train_set.fingerprint, "metrics": metrics, "seconds": round(seconds, 1)}
-    save_bench(out / "evaluator", dict(judges.items()), facts)
+    if team.first:
+        save_bench(out / "evaluator", dict(judges.items()), facts)
     return LoopResult(nn.ModuleDict({"evaluator": judges}), metrics, seconds)
 
 

@@ -93,7 +93,8 @@ class MACVAE(nn.Module):
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> VAEOutput:
         """Encode, sample with the generator's noise, decode. (B,T,D) -> VAEOutput."""
         mean, logvar = self.encode(x)
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
+        device = generator.device if generator is not None else mean.device
+        noise = torch.randn(mean.shape, generator=generator, device=device, dtype=mean.dtype).to(mean.device)
         z = mean + (0.5 * logvar).exp() * noise
         return VAEOutput(recon=self.decode(z), mean=mean, logvar=logvar, z=z)
 

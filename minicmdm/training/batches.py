@@ -8,7 +8,7 @@ model that a motion need not begin at rest with its first sentence.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -119,6 +119,7 @@ def encode_dataset(vae: MACVAE, data: MotionDataset, stats: tuple[Tensor, Tensor
     `stats` (shift, scale) are those of the training set; without them they are measured here, on sampled latents:
     the variance of a sample is the variance of the means plus the mean of the posterior variances.
     """
+    device = next(vae.parameters()).device
     means: list = [None] * len(data.clips)
     stds: list = [None] * len(data.clips)
     order = sorted(range(len(data.clips)), key=lambda i: len(data.clips[i].features))
@@ -128,8 +129,8 @@ def encode_dataset(vae: MACVAE, data: MotionDataset, stats: tuple[Tensor, Tensor
         batch = np.zeros((len(chosen), 4 * max(counts), data.mean.shape[0]), np.float32)
         for row, i, n in zip(batch, chosen, counts):  # zeros after the end: a causal encoder never looks there
             row[: 4 * n] = (data.clips[i].features[: 4 * n] - data.mean) / data.std
-        mean, logvar = vae.encode(torch.from_numpy(batch))  # (B,N,C) each
-        for i, n, m, s in zip(chosen, counts, mean, (0.5 * logvar).exp()):
+        mean, logvar = vae.encode(torch.from_numpy(batch).to(device))  # (B,N,C) each
+        for i, n, m, s in zip(chosen, counts, mean.cpu(), (0.5 * logvar).exp().cpu()):
             means[i], stds[i] = m[:n].clone(), s[:n].clone()
     if stats is None:
         every_mean, every_std = torch.cat(means), torch.cat(stds)  # (all latents, C)
@@ -160,6 +161,11 @@ class DenoiserBatch:
     choice: Tensor  # (B,R) index into `sentences`; -1 where a sample has fewer than R
     owner: Tensor  # (B,N) which of its sample's R sentences a latent sees
     clock: Tensor  # (B,N,2) latents since its sentence began, and left of it (-1: hidden)
+
+    def to(self, device: torch.device) -> DenoiserBatch:
+        """The same batch on a device."""
+        tensors = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **tensors)
 
 
 def draw_batch(

@@ -16,14 +16,23 @@ from minicmdm.models.text import TextEncoder, WordCache, Words
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, said, words_per_latent
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
+from minicmdm.training.team import ALONE, Team
 
 
 def train_dit(
-    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+    plan: Preset,
+    train_set: MotionDataset,
+    val_set: MotionDataset,
+    out: Path,
+    *,
+    resume: bool,
+    progress: bool,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Learn the denoiser: clips are encoded once, sentences once each, and every latent gets its own noise level."""
     cfg = plan.train
     vae, stats = checkpoints.load_vae(out, plan)
+    vae.to(team.device)
     shift_scale = stats["latent_mean"], stats["latent_std"]
     latents = encode_dataset(vae, train_set, shift_scale)
     val_latents = encode_dataset(vae, val_set, shift_scale)
@@ -52,8 +61,10 @@ def train_dit(
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
     for name in ("vae.safetensors", "text/model.safetensors"):
         identity[name] = checkpoints.checksum(out / name)
-    result = fit("dit", models, loss, validate, config, out, identity=identity, resume=resume, progress=progress)
-    checkpoints.save_dit(out, result.ema["dit"])
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    result = fit("dit", models, loss, validate, config, out, **how)
+    if team.first:
+        checkpoints.save_dit(out, result.ema["dit"])
     return result
 
 
@@ -68,7 +79,8 @@ def denoising_loss(
 ) -> Tensor:
     """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent.
 
-    `drops` says how often a whole sentence is dropped, and how often a single word.
+    `drops` says how often a whole sentence is dropped, and how often a single word. All is drawn on the CPU, the same
+    for every device, and then goes to the denoiser's.
     """
     batch = draw_batch(latents, count, drops[0], generator)
     block_size, committed, visible = plan.dit.block_size, None, batch.valid
@@ -78,9 +90,13 @@ def denoising_loss(
         t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
         if plan.dit.attention == "window":
             committed, visible = draw_boundary(batch.valid, block_size, generator)
-    with torch.autocast("cpu", torch.bfloat16, enabled=plan.train.bfloat16):
-        read = dit.read(hide_words(words.encode(batch.sentences), drops[1], generator))  # each sentence once: (U,S1,E)
-        seen, mask = words_per_latent(read, batch.choice, batch.owner)  # (B,S,E), (B,N,S)
+    said = hide_words(words.encode(batch.sentences), drops[1], generator)  # each sentence once: (U,S1,E)
+    device = dit.out.weight.device
+    batch, said = batch.to(device), Words(said.embeddings.to(device), said.mask.to(device))
+    t, visible = t.to(device), visible.to(device)
+    committed = None if committed is None else committed.to(device)
+    with torch.autocast(device.type, torch.bfloat16, enabled=plan.train.bfloat16):
+        seen, mask = words_per_latent(dit.read(said), batch.choice, batch.owner)  # (B,S,E), (B,N,S)
         return diffusion_forcing_loss(
             dit,
             batch.z,

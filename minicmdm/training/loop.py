@@ -27,6 +27,7 @@ from minicmdm.config import Preset
 from minicmdm.files import whole_file
 from minicmdm.training.checkpoints import load_tensors, save_tensors
 from minicmdm.training.muon import Muon, inner_matrices
+from minicmdm.training.team import ALONE, Team
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class LoopConfig:
     grad_clip: float = 1.0
     ema: float = 0.999
     muon: float = 0.0  # Muon's learning rate for the matrices of transformer blocks; 0: AdamW for everything
+    accumulate: int = 1  # micro-batches a step
     seed: int = 0
     log_every: int = 20
     validate_every: int = 500
@@ -59,6 +61,7 @@ def loop_config(plan: Preset, steps: int, lr: float, warmup: int, muon: float = 
         grad_clip=cfg.grad_clip,
         ema=cfg.ema,
         muon=muon,
+        accumulate=cfg.accumulate,
         seed=cfg.seed,
         log_every=max(1, min(20, steps // 4)),
         validate_every=every,
@@ -128,12 +131,16 @@ def fit(
     identity: Mapping[str, object],
     resume: bool = False,
     progress: bool = True,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Train `models` on `loss` for `config.steps` steps, leaving state, CSV and picture of the losses in `folder`.
 
     `loss(models, step, generator)` returns the scalar to descend and numbers to log; `validate(ema)` returns numbers.
     `identity` (preset, seed, data) is stored with the state: a resume with another identity is refused with ValueError.
+    The micro-batches of a step are shared by the processes of `team`; its first one alone validates and writes.
     """
+    share = team.share(config.accumulate)
+    models.to(team.device)
     state_file = folder / f"state_{name}.safetensors"
     table_file = folder / f"losses_{name}.csv"
     ema = copy.deepcopy(models).eval().requires_grad_(False)
@@ -146,14 +153,19 @@ def fit(
 
     models.train()
     clock = time.perf_counter() - seconds
-    bar = tqdm(total=config.steps, initial=start, desc=f"train {name}", disable=not progress, mininterval=1.0)
+    quiet = not (progress and team.first)
+    bar = tqdm(total=config.steps, initial=start, desc=f"train {name}", disable=quiet, mininterval=1.0)
     for step in range(start, config.steps):
-        key = step_key(config.seed, step)
-        with torch.random.fork_rng(devices=[]):  # the layers' own dropout draws from the global generator: key it too
-            torch.manual_seed(key)
-            value, numbers = loss(models, step, torch.Generator().manual_seed(key))
         models.zero_grad(set_to_none=True)
-        value.backward()
+        total = torch.zeros((), device=team.device)
+        for part in share:
+            key = step_key(config.seed, step * config.accumulate + part)
+            with torch.random.fork_rng(devices=[]):  # layers' own dropout draws from the global generator: key it too
+                torch.manual_seed(key)
+                value, numbers = loss(models, step, torch.Generator().manual_seed(key))
+            (value / config.accumulate).backward()
+            total += value.detach() / config.accumulate
+        team.add_up([total, *(weight.grad for weight in weights if weight.grad is not None)])
         norm = nn.utils.clip_grad_norm_(weights, config.grad_clip)
         if not torch.isfinite(norm):
             raise ValueError(f"training {name}: the gradient at step {step} is not finite; try a lower learning rate")
@@ -164,20 +176,20 @@ def fit(
 
         done, last = step + 1, step + 1 == config.steps
         if done % config.log_every == 0 or last:
-            row = {"step": done, "loss": float(value.detach()), **numbers, "grad_norm": float(norm)}
+            row = {"step": done, "loss": float(total), **numbers, "grad_norm": float(norm)}
             table.append({**row, "lr": learning_rate(config, step)})
             bar.set_postfix(
                 {"loss": f"{row['loss']:.4f}", **{k: f"{v:.4g}" for k, v in metrics.items()}}, refresh=False
             )
         if done % config.validate_every == 0 or last:
-            metrics = validate(ema)
+            metrics = validate(ema) if team.first else {}
             table.append({"step": done, **metrics})
-        if done % config.save_every == 0 or last:
+        if team.first and (done % config.save_every == 0 or last):
             _save(state_file, models, ema, optimizers, done, time.perf_counter() - clock, table, metrics, identity)
             write_table(table_file, table)
         bar.update(1)
     bar.close()
-    if table:
+    if table and team.first:
         from minicmdm.viz.plots import save_loss_curves
 
         write_table(table_file, table)

@@ -27,10 +27,18 @@ from minicmdm.models.vae import MACVAE, vae_loss
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import crop_features, draw_captioned, encode_dataset, said
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
+from minicmdm.training.team import ALONE, Team
 
 
 def train_teacher(
-    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+    plan: Preset,
+    train_set: MotionDataset,
+    val_set: MotionDataset,
+    out: Path,
+    *,
+    resume: bool,
+    progress: bool,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Learn Part-TMR and the text encoder together by contrast; write tmr.safetensors and text/."""
     cfg = plan.train
@@ -39,13 +47,13 @@ def train_teacher(
         again = resume and (out / "state_tmr.safetensors").is_file()
         text = new_text_encoder(plan, train_set, out / "text" if again else None)
         models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, text)})
-    if not again:  # written down at once, so that a resumed run goes on with the very vocabulary it began with
+    if not again and team.first:  # at once, so that a resumed run goes on with the very vocabulary it began with
         checkpoints.save_text(out, text)
 
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         x, valid, captions, same = draw_captioned(train_set, cfg.tmr_batch, generator)
-        teacher = models["tmr"]
-        with torch.autocast("cpu", torch.bfloat16, enabled=cfg.bfloat16):
+        teacher, x, valid, same = models["tmr"], x.to(team.device), valid.to(team.device), same.to(team.device)
+        with torch.autocast(team.device.type, torch.bfloat16, enabled=cfg.bfloat16):
             motion, words = teacher.motion(x, valid), teacher.sentences(captions)  # (B,E) each
         value = contrastive_loss(teacher.similarity(motion, words), same)
         return value, {"scale": teacher.log_scale.exp().item()}
@@ -56,8 +64,10 @@ def train_teacher(
 
     config = loop_config(plan, cfg.tmr_steps, cfg.tmr_lr, cfg.tmr_warmup)
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
-    result = fit("tmr", models, loss, validate, config, out, identity=identity, resume=resume, progress=progress)
-    checkpoints.save_teacher(out, result.ema["tmr"])
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    result = fit("tmr", models, loss, validate, config, out, **how)
+    if team.first:
+        checkpoints.save_teacher(out, result.ema["tmr"])
     return result
 
 
@@ -72,9 +82,10 @@ def new_text_encoder(plan: Preset, train_set: MotionDataset, folder: Path | None
 @torch.no_grad()
 def teacher_retrieval(teacher: MotionTeacher, train_set: MotionDataset, clips: MotionDataset) -> np.ndarray:
     """R@1, 2, 3 of the teacher on `clips`, in pools of 32 with first captions; `train_set` normalises. (3,)"""
-    motions = [teacher.motion(normalised(train_set, clip.features)[None])[0] for clip in clips.clips]
+    device = teacher.log_scale.device
+    motions = [teacher.motion(normalised(train_set, clip.features)[None].to(device))[0] for clip in clips.clips]
     words = torch.cat([teacher.sentences([clip.captions[0]]) for clip in clips.clips])  # (N,E)
-    unit = [nn.functional.normalize(x, dim=-1).double().numpy() for x in (words, torch.stack(motions))]
+    unit = [nn.functional.normalize(x, dim=-1).cpu().double().numpy() for x in (words, torch.stack(motions))]
     return r_precision(*unit, pool=min(32, len(clips)))
 
 
@@ -84,12 +95,19 @@ def normalised(train_set: MotionDataset, features: np.ndarray) -> Tensor:
 
 
 def train_vae(
-    plan: Preset, train_set: MotionDataset, val_set: MotionDataset, out: Path, *, resume: bool, progress: bool
+    plan: Preset,
+    train_set: MotionDataset,
+    val_set: MotionDataset,
+    out: Path,
+    *,
+    resume: bool,
+    progress: bool,
+    team: Team = ALONE,
 ) -> LoopResult:
     """Learn the causal VAE on crops, aligned with the teacher; then measure the latents, write vae and stats."""
     cfg = plan.train
     aligned = cfg.align_weight > 0
-    guides = teacher_frames(checkpoints.load_teacher(out, plan), train_set) if aligned else None
+    guides = teacher_frames(checkpoints.load_teacher(out, plan).to(team.device), train_set) if aligned else None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_key(cfg.seed, -1))
         models = nn.ModuleDict({"vae": MACVAE(plan.vae)})
@@ -98,7 +116,8 @@ def train_vae(
 
     def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
         x, guide = crop_features(train_set, cfg.vae_batch, cfg.crop_frames, generator, guides)  # (B,T,D), (B,T,E)
-        with torch.autocast("cpu", torch.bfloat16, enabled=cfg.bfloat16):
+        x, guide = x.to(team.device), None if guide is None else guide.to(team.device)
+        with torch.autocast(team.device.type, torch.bfloat16, enabled=cfg.bfloat16):
             output = models["vae"](x, generator)
         terms = vae_loss(output, x, cfg)
         numbers = {"recon": terms.recon.item(), "root": terms.root.item(), "kl": terms.kl.item()}
@@ -118,7 +137,8 @@ def train_vae(
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
     if aligned:
         identity["teacher"] = checkpoints.checksum(out / "tmr.safetensors")
-    result = fit("vae", models, loss, validate, config, out, identity=identity, resume=resume, progress=progress)
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    result = fit("vae", models, loss, validate, config, out, **how)
     vae = result.ema["vae"]
     latents = encode_dataset(vae, train_set)
     stats = {
@@ -127,7 +147,8 @@ def train_vae(
         "latent_mean": latents.shift,
         "latent_std": latents.scale,
     }
-    checkpoints.save_vae(out, vae, stats)
+    if team.first:
+        checkpoints.save_vae(out, vae, stats)
     return result
 
 
@@ -137,16 +158,16 @@ def teacher_frames(teacher: MotionTeacher, data: MotionDataset) -> list[Tensor]:
 
     Computed once: the teacher is frozen, and a crop's frames mean what they mean in their clip.
     """
-    out: list = [None] * len(data.clips)
+    device, out = teacher.log_scale.device, [None] * len(data.clips)
     order = sorted(range(len(out)), key=lambda i: len(data.clips[i].features))
     for first in range(0, len(order), 64):
         chosen = order[first : first + 64]
-        clips = [normalised(data, data.clips[i].features) for i in chosen]
-        lengths = torch.tensor([len(x) for x in clips])
-        valid = torch.arange(int(lengths.max())) < lengths[:, None]  # (B,T)
+        clips = [normalised(data, data.clips[i].features).to(device) for i in chosen]
+        lengths = torch.tensor([len(x) for x in clips], device=device)
+        valid = torch.arange(int(lengths.max()), device=device) < lengths[:, None]  # (B,T)
         frames = teacher.frames(nn.utils.rnn.pad_sequence(clips, batch_first=True), valid)  # (B,T,E)
         for i, features, length in zip(chosen, frames, lengths):
-            out[i] = features[:length].clone()
+            out[i] = features[:length].cpu().clone()
     return out
 
 
@@ -158,13 +179,14 @@ def reconstruction_mpjpe(
 
     `train_set` gives the normalisation. The mean is over all frames and joints of the first `count` clips.
     """
-    mean, std = torch.from_numpy(train_set.mean), torch.from_numpy(train_set.std)
+    device = next(vae.parameters(), torch.empty(0)).device
+    mean, std = torch.from_numpy(train_set.mean).to(device), torch.from_numpy(train_set.std).to(device)
     total, frames = 0.0, 0
     for clip in val_set.clips[:count]:
         length = len(clip.features) // 4 * 4
-        x = torch.from_numpy(clip.features[:length])
+        x = torch.from_numpy(clip.features[:length]).to(device)
         recon = vae.decode(vae.encode(((x - mean) / std)[None])[0])[0] * std + mean  # (T,D)
-        truth, guess = features_to_joints(clip.features[:length]), features_to_joints(recon.numpy())  # (T,22,3)
+        truth, guess = features_to_joints(clip.features[:length]), features_to_joints(recon.cpu().numpy())  # (T,22,3)
         total += length * mpjpe(guess, truth)
         frames += length
     return float(1000 * total / frames)

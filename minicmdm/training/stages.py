@@ -25,6 +25,7 @@ from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
 from minicmdm.training.representation import train_teacher, train_vae
+from minicmdm.training.team import Team
 
 RUN = {"evaluator": train_bench, "tmr": train_teacher, "vae": train_vae, "dit": train_dit}
 NEEDS = {"evaluator": (), "tmr": (), "vae": ("tmr.safetensors",), "dit": ("vae.safetensors", "text/model.safetensors")}
@@ -32,6 +33,10 @@ STAGES = (*RUN, "all")
 FAST = {f"{name}_steps": 30 for name in RUN} | {f"{name}_batch": 8 for name in RUN}
 FAST |= {f"{name}_warmup": 5 for name in RUN if name != "evaluator"}
 Say = Callable[[str], None]
+
+
+def _silent(line: str) -> None:
+    pass
 
 
 def train(
@@ -44,14 +49,17 @@ def train(
     data: str | Path | None = None,
     seed: int | None = None,
     compile: bool = False,
+    accumulate: int | None = None,
+    device: str = "cpu",
     progress: bool = True,
     command: str = "",
-    say: Say = lambda line: None,
+    say: Say = _silent,
 ) -> Path:
     """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
     `compile` makes the denoiser's steps shorter, where there is a C++ compiler.
+    `accumulate` and `device`: see team.py.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """
     plan = preset(preset_name) if isinstance(preset_name, str) else preset_name
@@ -61,6 +69,10 @@ def train(
     plan = replace(plan, train=replace(plan.train, **own))
     if fast:
         plan = replace(plan, train=replace(plan.train, **FAST))
+    if accumulate is not None:
+        plan = replace(plan, train=replace(plan.train, accumulate=accumulate))
+    team = Team(device, together=True)
+    team.share(plan.train.accumulate)
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"--out {out} is a file: training writes a folder")
@@ -72,7 +84,10 @@ def train(
             )
     if stage != "all" and (missing := [file for file in NEEDS[stage] if not (out / file).is_file()]):
         raise FileNotFoundError(f"{out} holds no {missing[0]}: stage {stage} needs the stages before it")
+    team.wait()
     out.mkdir(parents=True, exist_ok=True)
+    if not team.first:
+        say = _silent
 
     say("reading the data")
     train_set, val_set = _datasets(data, fast, progress)
@@ -86,13 +101,15 @@ def train(
         "fast": fast,
     }
     for name in wanted:
-        result = RUN[name](plan, train_set, val_set, out, resume=resume, progress=progress)
+        result = RUN[name](plan, train_set, val_set, out, resume=resume, progress=progress, team=team)
         facts["metrics"] |= result.metrics
         facts["seconds"] |= {name: round(result.seconds, 1)}
         facts["commands"] |= {name: command}
         facts["parameters"] |= {key: sum(w.numel() for w in part.parameters()) for key, part in result.ema.items()}
         facts["made"] = time.strftime("%Y-%m-%d", time.gmtime())
-        checkpoints.write_card(out, plan, facts)
+        if team.first:
+            checkpoints.write_card(out, plan, facts)
+        team.wait()  # the next stage reads what this one wrote
         say(f"stage {name}: {result.seconds:.0f} s, " + ", ".join(f"{k} {v:.4g}" for k, v in result.metrics.items()))
     return out
 

@@ -1,0 +1,118 @@
+"""Several processes train as one does: the same losses, the same weights, one set of files."""
+
+import csv
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch import nn
+
+from minicmdm.training import stages
+from minicmdm.training.checkpoints import load_tensors
+from minicmdm.training.loop import LoopConfig, fit
+from minicmdm.training.team import Team
+
+SCRIPT = """
+import sys
+from dataclasses import replace
+import torch
+from minicmdm.config import preset
+from minicmdm.training import stages
+torch.set_num_threads(1)
+plan = preset("micro")
+steps = {f"{name}_steps": 10 for name in stages.RUN} | {f"{name}_batch": 4 for name in stages.RUN}
+stages.FAST.update(steps)
+plan = replace(plan, train=replace(plan.train, bfloat16=False))
+for stage in ("tmr", "vae", "dit"):
+    stages.train(plan, sys.argv[1], stage, fast=True, accumulate=2, progress=False)
+"""
+
+
+def losses(folder):
+    """The losses of every stage, as they were logged."""
+    found = {}
+    for path in sorted(folder.glob("losses_*.csv")):
+        with open(path, encoding="utf-8", newline="") as file:
+            found[path.name] = [float(row["loss"]) for row in csv.DictReader(file) if row["loss"]]
+    return found
+
+
+def test_two_processes_train_as_one(tmp_path):
+    pytest.importorskip("accelerate", reason="needs the extra [scale]")
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2", "--num_machines", "1"]
+    launch += ["--mixed_precision", "no", "--dynamo_backend", "no", "--main_process_port", "0"]
+    for how, out in (([], "one"), (launch, "two")):
+        done = subprocess.run(
+            [sys.executable, *how, str(script), str(tmp_path / out)], capture_output=True, text=True, timeout=300
+        )
+        assert done.returncode == 0, done.stderr
+    one, two = losses(tmp_path / "one"), losses(tmp_path / "two")
+    assert set(one) == set(two) == {"losses_tmr.csv", "losses_vae.csv", "losses_dit.csv"}
+    for name, values in one.items():
+        assert len(values) > 3
+        assert two[name] == pytest.approx(values, rel=1e-5), name
+    for name in ("tmr", "vae", "dit"):
+        weights = [load_tensors(tmp_path / out / f"{name}.safetensors")[0] for out in ("one", "two")]
+        for key, value in weights[0].items():
+            torch.testing.assert_close(weights[1][key], value, rtol=1e-4, atol=1e-5)
+
+
+def line(parts, batch, tmp_path):
+    """A straight line fitted to numbers that a generator draws, `parts` batches a step."""
+    torch.manual_seed(0)
+    models = nn.ModuleDict({"net": nn.Linear(3, 1)})
+    seen = []
+
+    def loss(models, step, generator):
+        x = torch.randn(batch, 3, generator=generator)
+        seen.append(x)
+        return (models["net"](x)[:, 0] - x.sum(1)).square().mean(), {}
+
+    config = LoopConfig(steps=3, lr=0.1, warmup=1, accumulate=parts)
+    result = fit("line", models, loss, lambda ema: {}, config, tmp_path, identity={}, progress=False)
+    return models["net"].weight, seen, result
+
+
+def test_micro_batches_are_different_and_their_gradients_are_the_mean(tmp_path):
+    weight, seen, _ = line(4, 5, tmp_path)
+    assert len(seen) == 12 and len({tuple(x.flatten().tolist()) for x in seen}) == 12
+    torch.manual_seed(0)
+    net = nn.Linear(3, 1)
+    optimizer = torch.optim.AdamW(net.parameters(), lr=0.1, betas=(0.9, 0.99), weight_decay=0.0)
+    from minicmdm.training.loop import learning_rate
+
+    for step in range(3):
+        x = torch.cat(seen[4 * step : 4 * step + 4])  # one batch of all of them has the same gradient
+        optimizer.zero_grad()
+        (net(x)[:, 0] - x.sum(1)).square().mean().backward()
+        nn.utils.clip_grad_norm_(net.parameters(), 1.0)
+        optimizer.param_groups[0]["lr"] = learning_rate(LoopConfig(steps=3, lr=0.1, warmup=1), step)
+        optimizer.step()
+    torch.testing.assert_close(weight, net.weight)
+
+
+def test_what_cannot_be_shared_is_refused():
+    team = Team()
+    team.size, team.rank = 3, 1
+    assert list(team.share(6)) == [1, 4]
+    with pytest.raises(ValueError, match="4 micro-batches .* 3 processes: give --accumulate 3"):
+        team.share(4)
+    with pytest.raises(ValueError, match="no device 'abacus'"):
+        Team("abacus")
+
+
+def test_a_run_of_several_processes_without_accelerate_says_so(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    assert Team().size == 1  # a loop outside `train` is nobody's team
+    with pytest.raises(ValueError, match="need accelerate"):
+        Team(together=True)
+
+
+def test_training_asks_for_a_device_before_it_touches_anything(tmp_path):
+    with pytest.raises(ValueError, match="no device"):
+        stages.train("micro", tmp_path / "run", fast=True, device="abacus")
+    assert not (tmp_path / "run").exists()
