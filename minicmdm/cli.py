@@ -144,6 +144,7 @@ def _parser() -> Parser:
     sub.add_argument(
         "--threads", type=int, default=1, help="CPU threads; on one, a run repeats bit for bit (default 1)"
     )
+    sub.add_argument("--dry-run", action="store_true", help="say what it will need, and stop")
     sub.add_argument("--device", default="cpu", help="cpu, cuda, mps ... (default cpu)")
     sub.add_argument("--accumulate", type=int, help="batches whose gradients make one step; processes share them")
 

@@ -190,10 +190,19 @@ def train(arguments: argparse.Namespace) -> None:
         raise ValueError("--out is empty: give a folder for the checkpoint")
     import torch
 
+    from minicmdm.config import preset
     from minicmdm.training.stages import train as run
 
     torch.set_num_threads(arguments.threads)
-    said = {key: value for key, value in vars(arguments).items() if key not in ("run", "command", "out")}
+    if arguments.dry_run or not arguments.fast:
+        from minicmdm.training.estimate import estimate
+
+        for line in estimate(preset(arguments.preset), arguments.accumulate or 1):
+            if arguments.stage in ("all", line.stage):
+                say(str(line))
+    if arguments.dry_run:
+        return
+    said = {key: value for key, value in vars(arguments).items() if key not in ("run", "command", "out", "dry_run")}
     flags = [
         f"--{key}" if value is True else f"--{key} {shlex.quote(str(value))}" for key, value in said.items() if value
     ]
