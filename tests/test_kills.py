@@ -22,7 +22,7 @@ def models():
         return nn.ModuleDict({"net": nn.ModuleDict({"blocks": blocks, "out": nn.Linear(8, 1)})})
 
 
-def loss(models, step, generator):
+def loss(models, _, generator):
     x = torch.randn(16, 8, generator=generator)
     h = x
     for block in models["net"]["blocks"]:

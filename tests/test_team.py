@@ -3,6 +3,7 @@
 import csv
 import subprocess
 import sys
+import time
 
 import pytest
 import torch
@@ -66,7 +67,7 @@ def line(parts, batch, tmp_path):
     models = nn.ModuleDict({"net": nn.Linear(3, 1)})
     seen = []
 
-    def loss(models, step, generator):
+    def loss(models, _, generator):
         x = torch.randn(batch, 3, generator=generator)
         seen.append(x)
         return (models["net"](x)[:, 0] - x.sum(1)).square().mean(), {}
@@ -92,6 +93,43 @@ def test_micro_batches_are_different_and_their_gradients_are_the_mean(tmp_path):
         optimizer.param_groups[0]["lr"] = learning_rate(LoopConfig(steps=3, lr=0.1, warmup=1), step)
         optimizer.step()
     torch.testing.assert_close(weight, net.weight)
+
+
+def test_batches_drawn_ahead_by_threads_come_in_order_and_are_the_same():
+    def work(turn):
+        time.sleep(0.02 * (turn % 3 == 0))  # some take longer than those after them
+        return turn, torch.randn(2, generator=torch.Generator().manual_seed(turn)).tolist()
+
+    one, many = (list(Team(workers=workers).ahead(work, range(20))) for workers in (0, 3))
+    assert one == many and [turn for turn, _ in many] == list(range(20))
+    with pytest.raises(ValueError, match="workers must not be negative"):
+        Team(workers=-1)
+
+
+def test_a_thread_that_fails_is_heard():
+    def work(turn):
+        raise ZeroDivisionError(turn)
+
+    with pytest.raises(ZeroDivisionError):
+        list(Team(workers=2).ahead(work, range(3)))
+
+
+def test_workers_change_no_number(tmp_path):
+    weights = []
+    for workers in (0, 2):
+        torch.manual_seed(0)
+        models = nn.ModuleDict({"net": nn.Linear(3, 1)})
+
+        def loss(models, x, generator):
+            noise = torch.randn(len(x), generator=generator)  # goes on where the draw left off
+            return (models["net"](x)[:, 0] - x.sum(1) + noise).square().mean(), {}
+
+        config, folder = LoopConfig(steps=9, lr=0.1, warmup=1, accumulate=2), tmp_path / str(workers)
+        folder.mkdir()
+        how = {"identity": {}, "progress": False, "draw": lambda generator: torch.randn(4, 3, generator=generator)}
+        fit("line", models, loss, lambda ema: {}, config, folder, team=Team(workers=workers), **how)
+        weights.append(models["net"].weight.detach().clone())
+    assert torch.equal(*weights)
 
 
 def test_what_cannot_be_shared_is_refused():

@@ -214,8 +214,11 @@ def train_evaluator(
     judge.mean.copy_(torch.from_numpy(train_set.mean[: cfg.dims]))
     judge.std.copy_(torch.from_numpy(train_set.std[: cfg.dims]))
 
-    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        clips, texts, misses, whose = draw_pairs(train_set, batch, generator)
+    def draw(generator: torch.Generator) -> tuple[list[Clip], list[str], list[str], list[int]]:
+        return draw_pairs(train_set, batch, generator)
+
+    def loss(models: nn.ModuleDict, drawn: tuple, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        clips, texts, misses, whose = drawn
         said = [clip.program or text for clip, text in zip(clips, texts)]
         # Not wrong answers, if not right ones.
         same = torch.tensor([[a == b for b in said] for a in said], device=team.device)
@@ -234,7 +237,7 @@ def train_evaluator(
     loop = LoopConfig(steps, lr, warmup=steps // 15, weight_decay=0.01, ema=0.99, accumulate=accumulate, seed=own)
     identity = asdict(cfg) | {"steps": steps, "batch": batch, "lr": lr, "seed": seed, "data": train_set.fingerprint}
     name, models = f"evaluator_{cfg.kind}_{cfg.dims}", nn.ModuleDict({"evaluator": judge})
-    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team, "draw": draw}
     return fit(name, models, loss, validate, loop, Path(out), **how)
 
 

@@ -12,9 +12,10 @@ from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
 from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase, draw_times
 from minicmdm.models.dit import CausalDiT
-from minicmdm.models.text import TextEncoder, WordCache, Words
+from minicmdm.models.text import TextEncoder, Words
+from minicmdm.models.wordcache import WordCache
 from minicmdm.training import checkpoints
-from minicmdm.training.batches import LatentSet, draw_batch, encode_dataset, said, words_per_latent
+from minicmdm.training.batches import DenoiserBatch, draw_batch, encode_dataset, said, words_per_latent
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
 from minicmdm.training.team import ALONE, Team
 
@@ -36,7 +37,8 @@ def train_dit(
     shift_scale = stats["latent_mean"], stats["latent_std"]
     latents = encode_dataset(vae, train_set, shift_scale)
     val_latents = encode_dataset(vae, val_set, shift_scale)
-    words = WordCache(TextEncoder.load(out / "text", plan.text), {"", *said(train_set), *said(val_set)})
+    text = TextEncoder.load(out / "text", plan.text).to(team.device)
+    words = WordCache(text, {"", *said(train_set), *said(val_set)}, progress=progress and team.first)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_key(cfg.seed, -2))
         dit = CausalDiT(plan.dit)
@@ -45,23 +47,28 @@ def train_dit(
             block.compile(dynamic=True)
     models = nn.ModuleDict({"dit": dit})
 
-    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        drops = cfg.text_drop, cfg.word_drop
-        return denoising_loss(models["dit"], words, latents, plan, cfg.dit_batch, drops, generator), {}
+    def draw(generator: torch.Generator) -> DenoiserBatch:
+        return draw_batch(latents, cfg.dit_batch, cfg.text_drop, generator)
+
+    def loss(
+        models: nn.ModuleDict, batch: DenoiserBatch, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, float]]:
+        return denoising_loss(models["dit"], words, batch, plan, cfg.word_drop, generator), {}
 
     @torch.no_grad()
     def validate(ema: nn.ModuleDict) -> dict[str, float]:
         losses = []
         for key in range(4):  # the same batches and the same noise every time
             generator = torch.Generator().manual_seed(key)
-            losses.append(denoising_loss(ema["dit"], words, val_latents, plan, 64, (0.0, 0.0), generator).item())
+            batch = draw_batch(val_latents, 64, 0.0, generator)
+            losses.append(denoising_loss(ema["dit"], words, batch, plan, 0.0, generator).item())
         return {"val_loss": float(np.mean(losses))}
 
     config = loop_config(plan, cfg.dit_steps, cfg.dit_lr, cfg.dit_warmup, cfg.dit_muon)
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
     for name in ("vae.safetensors", "text/model.safetensors"):
         identity[name] = checkpoints.checksum(out / name)
-    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team, "draw": draw}
     result = fit("dit", models, loss, validate, config, out, **how)
     if team.first:
         checkpoints.save_dit(out, result.ema["dit"])
@@ -71,18 +78,16 @@ def train_dit(
 def denoising_loss(
     dit: CausalDiT,
     words: WordCache,
-    latents: LatentSet,
+    batch: DenoiserBatch,
     plan: Preset,
-    count: int,
-    drops: tuple[float, float],
+    word_drop: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draw a batch, let every latent see its words, and ask for the velocity at one noise level per latent.
+    """Let every latent of a batch see its words, and ask for the velocity at one noise level per latent.
 
-    `drops` says how often a whole sentence is dropped, and how often a single word. All is drawn on the CPU, the same
-    for every device, and then goes to the denoiser's.
+    `word_drop` says how often a word is hidden. All is drawn on the CPU, the same for every device, and then goes to
+    the denoiser's.
     """
-    batch = draw_batch(latents, count, drops[0], generator)
     block_size, committed, visible = plan.dit.block_size, None, batch.valid
     if plan.train.levels == "staircase":
         t, committed, visible = draw_staircase(batch.valid, block_size, generator)
@@ -90,7 +95,7 @@ def denoising_loss(
         t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
         if plan.dit.attention == "window":
             committed, visible = draw_boundary(batch.valid, block_size, generator)
-    said = hide_words(words.encode(batch.sentences), drops[1], generator)  # each sentence once: (U,S1,E)
+    said = hide_words(words.encode(batch.sentences), word_drop, generator)  # each sentence once: (U,S1,E)
     device = dit.out.weight.device
     batch, said = batch.to(device), Words(said.embeddings.to(device), said.mask.to(device))
     t, visible = t.to(device), visible.to(device)

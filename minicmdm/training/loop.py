@@ -17,6 +17,7 @@ import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import torch
@@ -78,7 +79,8 @@ class LoopResult:
     seconds: float
 
 
-Loss = Callable[[nn.ModuleDict, int, torch.Generator], tuple[Tensor, dict[str, float]]]
+Draw = Callable[[torch.Generator], object]
+Loss = Callable[[nn.ModuleDict, object, torch.Generator], tuple[Tensor, dict[str, float]]]
 Validate = Callable[[nn.ModuleDict], dict[str, float]]
 
 
@@ -132,10 +134,12 @@ def fit(
     resume: bool = False,
     progress: bool = True,
     team: Team = ALONE,
+    draw: Draw = lambda generator: None,
 ) -> LoopResult:
     """Train `models` on `loss` for `config.steps` steps, leaving state, CSV and picture of the losses in `folder`.
 
-    `loss(models, step, generator)` returns the scalar to descend and numbers to log; `validate(ema)` returns numbers.
+    `loss(models, batch, generator)` returns the scalar to descend and numbers to log, for the batch of
+    `draw(generator)`, which a thread of `team` may have drawn ahead of time; `validate(ema)` returns numbers.
     `identity` (preset, seed, data) is stored with the state: a resume with another identity is refused with ValueError.
     The micro-batches of a step are shared by the processes of `team`; its first one alone validates and writes.
     """
@@ -155,14 +159,17 @@ def fit(
     clock = time.perf_counter() - seconds
     quiet = not (progress and team.first)
     bar = tqdm(total=config.steps, initial=start, desc=f"train {name}", disable=quiet, mininterval=1.0)
+    keys = (
+        step_key(config.seed, step * config.accumulate + part) for step in range(start, config.steps) for part in share
+    )
+    drawn = team.ahead(lambda key: _drawn(key, draw), keys)
     for step in range(start, config.steps):
         models.zero_grad(set_to_none=True)
         total = torch.zeros((), device=team.device)
-        for part in share:
-            key = step_key(config.seed, step * config.accumulate + part)
+        for key, batch, generator in islice(drawn, len(share)):
             with torch.random.fork_rng(devices=[]):  # layers' own dropout draws from the global generator: key it too
                 torch.manual_seed(key)
-                value, numbers = loss(models, step, torch.Generator().manual_seed(key))
+                value, numbers = loss(models, batch, generator)
             (value / config.accumulate).backward()
             total += value.detach() / config.accumulate
         team.add_up([total, *(weight.grad for weight in weights if weight.grad is not None)])
@@ -196,6 +203,11 @@ def fit(
         with whole_file(folder / f"losses_{name}.png") as temporary:
             save_loss_curves(table_file, temporary)
     return LoopResult(ema, metrics, seconds if start >= config.steps else time.perf_counter() - clock)
+
+
+def _drawn(key: int, draw: Draw) -> tuple[int, object, torch.Generator]:
+    generator = torch.Generator().manual_seed(key)
+    return key, draw(generator), generator
 
 
 def _save(path, models, ema, optimizers, step, seconds, table, metrics, identity) -> None:

@@ -13,19 +13,29 @@ Only the first process validates, speaks and writes files.
 from __future__ import annotations
 
 import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import TypeVar
 
 import torch
 from torch import Tensor
+
+T = TypeVar("T")
 
 
 class Team:
     """One process alone, or (`together`) one among those that `accelerate launch` started, if it did.
 
     device: "cpu", "cuda", "mps" or any name torch knows; each of several processes gets a GPU of its own.
+    workers: threads that draw the next batches while a step is computed; they change no number.
     ValueError: a device this machine has not, or several processes without `accelerate`.
     """
 
-    def __init__(self, device: str = "cpu", together: bool = False):
+    def __init__(self, device: str = "cpu", together: bool = False, workers: int = 0):
+        if workers < 0:
+            raise ValueError(f"workers must not be negative, and {workers} came")
+        self.workers = workers
         try:
             self.device = torch.device(device)
             torch.empty(1, device=self.device)
@@ -54,6 +64,20 @@ class Team:
                 f"give --accumulate {self.size} or a multiple of it"
             )
         return range(self.rank, micro_batches, self.size)
+
+    def ahead(self, work: Callable[[int], T], keys: Iterable[int]) -> Iterator[T]:
+        """`work` done for each key, in their order; with workers, for the next few keys at the same time."""
+        if self.workers == 0:
+            yield from map(work, keys)
+            return
+        with ThreadPoolExecutor(self.workers) as threads:
+            waiting: deque[Future[T]] = deque()
+            for key in keys:
+                waiting.append(threads.submit(work, key))
+                if len(waiting) > self.workers:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
 
     def add_up(self, tensors: list[Tensor]) -> None:
         """Replace each tensor by its sum over all processes; they go as one, since small messages are slow."""
