@@ -159,10 +159,8 @@ def fit(
     clock = time.perf_counter() - seconds
     quiet = not (progress and team.first)
     bar = tqdm(total=config.steps, initial=start, desc=f"train {name}", disable=quiet, mininterval=1.0)
-    keys = (
-        step_key(config.seed, step * config.accumulate + part) for step in range(start, config.steps) for part in share
-    )
-    drawn = team.ahead(lambda key: _drawn(key, draw), keys)
+    turns = (step * config.accumulate + part for step in range(start, config.steps) for part in share)
+    drawn = team.ahead(lambda turn: _drawn(step_key(config.seed, turn), draw), turns)
     for step in range(start, config.steps):
         models.zero_grad(set_to_none=True)
         total = torch.zeros((), device=team.device)
