@@ -139,6 +139,7 @@ def _parser() -> Parser:
         "--fast", action="store_true", help="a smoke run of seconds: everything happens, nothing is learnt"
     )
     sub.add_argument("--data", help="a folder in HumanML3D's layout (default: the toy world)")
+    sub.add_argument("--text", help="a pretrained text encoder, kept as it is: minilm, a folder, or a hub name")
     sub.add_argument("--seed", type=int, help="seed of weights and batches (default: the preset's)")
     sub.add_argument("--compile", action="store_true", help="train faster; needs a C++ compiler on this machine")
     sub.add_argument(
@@ -146,6 +147,7 @@ def _parser() -> Parser:
     )
     sub.add_argument("--dry-run", action="store_true", help="say what it will need, and stop")
     sub.add_argument("--device", default="cpu", help="cpu, cuda, mps ... (default cpu)")
+    sub.add_argument("--workers", type=int, default=0, help="threads that draw batches ahead (default 0)")
     sub.add_argument("--accumulate", type=int, help="batches whose gradients make one step; processes share them")
 
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")

@@ -195,9 +195,13 @@ def train(arguments: argparse.Namespace) -> None:
 
     torch.set_num_threads(arguments.threads)
     if arguments.dry_run or not arguments.fast:
+        from minicmdm.models.text import with_encoder
         from minicmdm.training.estimate import estimate
 
-        for line in estimate(preset(arguments.preset), arguments.accumulate or 1):
+        plan = preset(arguments.preset)
+        if arguments.text is not None:
+            plan = with_encoder(plan, arguments.text)
+        for line in estimate(plan, arguments.accumulate or 1):
             if arguments.stage in ("all", line.stage):
                 say(str(line))
     if arguments.dry_run:
@@ -217,6 +221,8 @@ def train(arguments: argparse.Namespace) -> None:
         compile=arguments.compile,
         accumulate=arguments.accumulate,
         device=arguments.device,
+        text=arguments.text,
+        workers=arguments.workers,
         command=" ".join(["minicmdm train", *flags]),
         say=say,
     )

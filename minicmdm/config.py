@@ -26,16 +26,17 @@ class VAEConfig:
 
 @dataclass(frozen=True)
 class TextConfig:
-    """A word-level DistilBERT: tiny with its own vocabulary (`path=None`), or one from a local folder."""
+    """A word-level encoder: a DistilBERT with its own vocabulary (`path=None`), or a pretrained one, which brings its
+    own sizes; but `dim` must be its width (`models.text.pretrained_config` reads it)."""
 
-    path: str | None = None
+    path: str | None = None  # "minilm", a folder, or a hub name whose files are on this machine
     dim: int = 768
     layers: int = 6
     heads: int = 12
     vocab_size: int = 30522  # an upper bound: a vocabulary trained from few captions ends up smaller
     max_words: int = 128  # word pieces per sentence, [CLS] and [SEP] counted; longer sentences are cut
     dropout: float = 0.0
-    frozen: bool = True  # True: never trained and always in eval mode
+    frozen: bool = True  # always in eval mode, never trained but for an own one, by the teacher; False: tuned by it
 
 
 @dataclass(frozen=True)
@@ -176,7 +177,7 @@ def _check_keys(cls, data, where: str):
 
 def _paper(name: str, heads: int, layers: int, dim: int) -> Preset:
     # The folder is looked for on this machine only; models/text.py says how to fill it.
-    text = TextConfig(path="distilbert-base-uncased")
+    text = TextConfig(path="distilbert-base-uncased", frozen=False)  # tuned with the teacher, as released
     return Preset(name, text=text, dit=DiTConfig(dim=dim, layers=layers, heads=heads))
 
 

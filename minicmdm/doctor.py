@@ -10,12 +10,19 @@ import tempfile
 import time
 from pathlib import Path
 
+from minicmdm.files import cache_folder
+from minicmdm.models.text import find_encoder, pretrained_config
+
 NEEDED = ("torch", "numpy", "scipy", "matplotlib", "pillow", "safetensors", "transformers", "tokenizers", "tqdm")
 OPTIONAL = {  # package -> what is missing without it
     "ipywidgets": "no sliders in notebooks: pip install 'minicmdm[notebooks]'",
     "anywidget": "no skeleton player in notebooks: pip install 'minicmdm[notebooks]'",
     "jupyterlab": "no notebooks: pip install 'minicmdm[notebooks]'",
     "pytest": "the tests cannot run: pip install 'minicmdm[dev]'",
+}
+TEXT_ENCODERS = {  # name -> what is missing without it; the presets toy and micro make their own
+    "minilm": "no `train --text minilm`",
+    "distilbert-base-uncased": "presets S to XL want another --text",
 }
 ENOUGH_DISK = 2e9  # bytes: the toy set takes 0.7 GB, a run's states 0.1
 
@@ -50,7 +57,13 @@ def examine() -> tuple[dict[str, object], list[str]]:
     facts["bfloat16_gflops"] = round(_gflops(torch, torch.bfloat16), 1)
     if facts["bfloat16_gflops"] < facts["matmul_gflops"]:
         wrong.append("bfloat16 is slower than float32 here: the toy preset, which trains in it, takes longer than told")
-    cache = Path(os.environ.get("MINICMDM_CACHE") or Path.home() / ".cache" / "minicmdm")
+    for name in TEXT_ENCODERS:
+        try:
+            facts[name.partition("-")[0]] = f"{pretrained_config(name).dim} wide, in {find_encoder(name)}"
+        except (FileNotFoundError, ValueError) as error:
+            facts[name.partition("-")[0]] = "missing"
+            wrong.append(f"{TEXT_ENCODERS[name]}: {error}")
+    cache = cache_folder()
     facts["cache"] = str(cache)
     wrong += _folder_troubles(cache)
     if not (Path(__file__).parent / "assets" / "toy" / "card.json").is_file():

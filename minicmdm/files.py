@@ -34,6 +34,11 @@ def write_text(path: str | Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
+def cache_folder() -> Path:
+    """Where what can be made again is kept: ~/.cache/minicmdm, or `MINICMDM_CACHE`. It need not exist."""
+    return Path(os.environ.get("MINICMDM_CACHE") or Path.home() / ".cache" / "minicmdm")
+
+
 def check_output(path: str | Path, endings: tuple[str, ...], force: bool = False) -> Path:
     """Say before any work is done whether `path` can be written; return it as a Path.
 

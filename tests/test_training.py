@@ -14,8 +14,9 @@ from conftest import make_fake_data
 from torch import nn
 
 from minicmdm.models.dit import CausalDiT
-from minicmdm.models.text import WordCache, Words
+from minicmdm.models.text import Words
 from minicmdm.models.vae import MACVAE, vae_loss
+from minicmdm.models.wordcache import WordCache
 from minicmdm.training import batches, checkpoints, denoiser, representation, stages
 from minicmdm.training.loop import LoopConfig, fit, learning_rate, step_key
 
@@ -154,6 +155,11 @@ def test_step_keys_do_not_collide():
     assert len(keys) == 20 * 502 and all(0 <= key < 2**63 for key in keys)
 
 
+def denoising_step(dit, words, latents, plan):
+    draws = generator()
+    return denoiser.denoising_loss(dit, words, batches.draw_batch(latents, 8, 0.0, draws), plan, 0.0, draws)
+
+
 def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
     torch.manual_seed(0)
     vae, x = MACVAE(tiny_preset.vae), batches.crop_features(fake_data, 8, 32, generator())[0]
@@ -161,7 +167,7 @@ def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
     dit = CausalDiT(tiny_preset.dit)
     cases = {
         "vae": (vae, lambda: vae_loss(vae(x, generator()), x, tiny_preset.train).recon),
-        "dit": (dit, lambda: denoiser.denoising_loss(dit, words, latents, tiny_preset, 8, (0.0, 0.0), generator())),
+        "dit": (dit, lambda: denoising_step(dit, words, latents, tiny_preset)),
     }
     for model, loss in cases.values():
         optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import os
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +19,7 @@ from minicmdm.data.programs import (
     pairs_of,
     sample_program,
 )
+from minicmdm.files import cache_folder
 
 SPLITS = {"train": 4096, "val": 256, "test": 1024}  # clips of the toy set
 KINDS = (
@@ -90,7 +90,7 @@ def make_folder(
 
 def cached_toy_folder(progress: bool = True) -> Path:
     """The whole toy set on disk (about 0.7 GB), made once, in ~/.cache/minicmdm or `MINICMDM_CACHE`."""
-    root = Path(os.environ.get("MINICMDM_CACHE") or Path.home() / ".cache" / "minicmdm")
+    root = cache_folder()
     root.mkdir(parents=True, exist_ok=True)
     folder = root / f"toy-{world_fingerprint()}"
     if not folder.is_dir():

@@ -96,6 +96,8 @@ class PartBlock(nn.Module):
 class MotionTeacher(nn.Module):
     """Motion and sentences in one space: Part-TMR or TMR by frames, and the text encoder that it teaches.
 
+    (Or the words of one that learns no more, read beforehand: a `WordCache`, no module and no part of its weights.)
+
     ValueError: an unknown `parts` or `mean`, or a width that does not split into heads.
     """
 
@@ -149,7 +151,7 @@ class MotionTeacher(nn.Module):
         The release reads [CLS] alone, so nothing asks the other words' vectors to mean anything; but the denoiser
         attends to all of them. The mean asks all of them, [CLS] and [SEP] included, which are all that "" has.
         """
-        words, mask = self.text.encode(sentences)  # (B,S,E), (B,S)
+        words, mask = (part.to(self.log_scale.device) for part in self.text.encode(sentences))  # (B,S,E), (B,S)
         return masked_mean(self.embed_words(words), mask)
 
     def similarity(self, motion: Tensor, text: Tensor) -> Tensor:

@@ -113,10 +113,14 @@ def save_vae(folder: Path, vae: MACVAE, stats: Mapping[str, Tensor]) -> None:
 
 
 def save_teacher(folder: Path, teacher: MotionTeacher) -> None:
-    """Write the teacher's own weights and, beside them, its text encoder, which the denoiser will read with."""
+    """Write the teacher's own weights and, beside them, its text encoder, which the denoiser will read with.
+
+    Words that were read once (wordcache.py) come from an encoder that did not learn: it lies there since the start.
+    """
     own = {key: value for key, value in teacher.state_dict().items() if not key.startswith("text.")}
     save_tensors(folder / "tmr.safetensors", own)
-    save_text(folder, teacher.text)
+    if isinstance(teacher.text, TextEncoder):
+        save_text(folder, teacher.text)
 
 
 def save_dit(folder: Path, dit: CausalDiT) -> None:

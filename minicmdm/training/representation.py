@@ -21,9 +21,10 @@ from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.evaluation.metrics import mpjpe, r_precision
-from minicmdm.models.text import TextEncoder
+from minicmdm.models.text import TextEncoder, find_encoder
 from minicmdm.models.tmr import MotionTeacher, contrastive_loss
 from minicmdm.models.vae import MACVAE, vae_loss
+from minicmdm.models.wordcache import WordCache
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import crop_features, draw_captioned, encode_dataset, said
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
@@ -40,18 +41,29 @@ def train_teacher(
     progress: bool,
     team: Team = ALONE,
 ) -> LoopResult:
-    """Learn Part-TMR and the text encoder together by contrast; write tmr.safetensors and text/."""
+    """Learn Part-TMR and the text encoder together by contrast; write tmr.safetensors and text/.
+
+    A pretrained encoder that is to stay as it is (a path, and `frozen`) is read once: the motion side alone learns, and
+    the linear map of the words.
+    """
     cfg = plan.train
     with torch.random.fork_rng(devices=[]):  # initial weights by the seed, and the caller's generator as it was
         torch.manual_seed(step_key(cfg.seed, -3))
         again = resume and (out / "state_tmr.safetensors").is_file()
         text = new_text_encoder(plan, train_set, out / "text" if again else None)
-        models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, text)})
+        read = text
+        if text.cfg.frozen:
+            sentences = said(train_set) | said(val_set)
+            read = WordCache(text.to(team.device), sentences, progress=progress and team.first)
+        models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, read)})
     if not again and team.first:  # at once, so that a resumed run goes on with the very vocabulary it began with
         checkpoints.save_text(out, text)
 
-    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        x, valid, captions, same = draw_captioned(train_set, cfg.tmr_batch, generator)
+    def draw(generator: torch.Generator) -> tuple[Tensor, Tensor, list[str], Tensor]:
+        return draw_captioned(train_set, cfg.tmr_batch, generator)
+
+    def loss(models: nn.ModuleDict, batch: tuple, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        x, valid, captions, same = batch
         teacher, x, valid, same = models["tmr"], x.to(team.device), valid.to(team.device), same.to(team.device)
         with torch.autocast(team.device.type, torch.bfloat16, enabled=cfg.bfloat16):
             motion, words = teacher.motion(x, valid), teacher.sentences(captions)  # (B,E) each
@@ -64,7 +76,7 @@ def train_teacher(
 
     config = loop_config(plan, cfg.tmr_steps, cfg.tmr_lr, cfg.tmr_warmup)
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
-    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team, "draw": draw}
     result = fit("tmr", models, loss, validate, config, out, **how)
     if team.first:
         checkpoints.save_teacher(out, result.ema["tmr"])
@@ -72,10 +84,13 @@ def train_teacher(
 
 
 def new_text_encoder(plan: Preset, train_set: MotionDataset, folder: Path | None = None) -> TextEncoder:
-    """An encoder that may learn: read from `folder` or the preset's path, or new, with the captions' own vocabulary."""
-    cfg = replace(plan.text, frozen=False)
+    """The encoder read from `folder` or the preset's path, or a new one with the captions' own vocabulary.
+
+    It may learn, but for one from a path that is `frozen`.
+    """
+    cfg = plan.text if plan.text.path is not None else replace(plan.text, frozen=False)
     if folder is not None or plan.text.path is not None:
-        return TextEncoder.load(folder or plan.text.path, cfg)
+        return TextEncoder.load(folder or find_encoder(plan.text.path), cfg)
     return TextEncoder.from_captions(sorted(said(train_set)), cfg)
 
 
@@ -114,8 +129,11 @@ def train_vae(
         if aligned:  # W of CMDM Eq. 4; only training needs it
             models["align"] = nn.Linear(plan.vae.latent_dim, plan.tmr.embed_dim, bias=False)
 
-    def loss(models: nn.ModuleDict, step: int, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-        x, guide = crop_features(train_set, cfg.vae_batch, cfg.crop_frames, generator, guides)  # (B,T,D), (B,T,E)
+    def draw(generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+        return crop_features(train_set, cfg.vae_batch, cfg.crop_frames, generator, guides)  # (B,T,D), (B,T,E)
+
+    def loss(models: nn.ModuleDict, batch: tuple, generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
+        x, guide = batch
         x, guide = x.to(team.device), None if guide is None else guide.to(team.device)
         with torch.autocast(team.device.type, torch.bfloat16, enabled=cfg.bfloat16):
             output = models["vae"](x, generator)
@@ -137,7 +155,7 @@ def train_vae(
     identity = {"preset": plan.to_dict(), "data": train_set.fingerprint}
     if aligned:
         identity["teacher"] = checkpoints.checksum(out / "tmr.safetensors")
-    how = {"identity": identity, "resume": resume, "progress": progress, "team": team}
+    how = {"identity": identity, "resume": resume, "progress": progress, "team": team, "draw": draw}
     result = fit("vae", models, loss, validate, config, out, **how)
     vae = result.ema["vae"]
     latents = encode_dataset(vae, train_set)

@@ -22,6 +22,7 @@ from minicmdm.config import Preset, preset
 from minicmdm.data.dataset import MotionDataset, cached_toy_folder, toy_dataset
 from minicmdm.data.folders import load_dataset
 from minicmdm.evaluation.evaluators import train_bench
+from minicmdm.models.text import find_encoder, with_encoder
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
 from minicmdm.training.representation import train_teacher, train_vae
@@ -51,6 +52,8 @@ def train(
     compile: bool = False,
     accumulate: int | None = None,
     device: str = "cpu",
+    text: str | None = None,
+    workers: int = 0,
     progress: bool = True,
     command: str = "",
     say: Say = _silent,
@@ -59,7 +62,8 @@ def train(
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
     `compile` makes the denoiser's steps shorter, where there is a C++ compiler.
-    `accumulate` and `device`: see team.py.
+    `accumulate`, `device`, `workers`: see team.py.
+    `text` names a pretrained text encoder ("minilm", a folder, a hub name that is on this machine) that stays frozen.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """
     plan = preset(preset_name) if isinstance(preset_name, str) else preset_name
@@ -71,7 +75,11 @@ def train(
         plan = replace(plan, train=replace(plan.train, **FAST))
     if accumulate is not None:
         plan = replace(plan, train=replace(plan.train, accumulate=accumulate))
-    team = Team(device, together=True)
+    if text is not None:
+        plan = with_encoder(plan, text)
+    elif plan.text.path is not None and stage in ("tmr", "all") and not resume:
+        find_encoder(plan.text.path)  # said now, and not after the judges have been trained
+    team = Team(device, together=True, workers=workers)
     team.share(plan.train.accumulate)
     out = Path(out)
     if out.exists() and not out.is_dir():
