@@ -339,6 +339,17 @@ def test_a_run_with_a_pretrained_encoder_leaves_it_as_it_was_and_carries_it_alon
     assert stages.train(plan, out, "tmr", resume=True, **how) == out
 
 
+@pytest.mark.parametrize("more", [[], ["--dry-run"]])
+@pytest.mark.parametrize("name", ["nothing", "x" * 300, "", "a\nb"])
+def test_the_command_line_says_in_one_line_that_an_encoder_is_not_here(tmp_path, capsys, name, more):
+    from minicmdm import cli
+
+    out = tmp_path / "run"
+    assert cli.main(["train", "--preset", "micro", "--text", name, "--out", str(out), *more]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("minicmdm: ") and told.count("\n") == 1 and not out.exists()
+
+
 def test_an_encoder_that_is_not_here_is_missed_before_anything_is_trained(tmp_path):
     from minicmdm.training import stages
 
