@@ -194,7 +194,7 @@ def train(arguments: argparse.Namespace) -> None:
     from minicmdm.training.stages import train as run
 
     torch.set_num_threads(arguments.threads)
-    if arguments.dry_run or not arguments.fast:
+    if arguments.dry_run:
         from minicmdm.models.text import with_encoder
         from minicmdm.training.estimate import estimate
 
@@ -202,9 +202,7 @@ def train(arguments: argparse.Namespace) -> None:
         if arguments.text is not None:
             plan = with_encoder(plan, arguments.text)
         for line in estimate(plan, arguments.accumulate or 1):
-            if arguments.stage in ("all", line.stage):
-                say(str(line))
-    if arguments.dry_run:
+            say(str(line))
         return
     said = {key: value for key, value in vars(arguments).items() if key not in ("run", "command", "out", "dry_run")}
     flags = [

@@ -25,6 +25,7 @@ from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.models.text import find_encoder, with_encoder
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
+from minicmdm.training.estimate import estimate
 from minicmdm.training.representation import train_teacher, train_vae
 from minicmdm.training.team import Team
 
@@ -100,6 +101,10 @@ def train(
     say("reading the data")
     train_set, val_set = _datasets(data, fast, progress)
     say(f"{len(train_set.clips)} clips to train on, {len(val_set.clips)} to validate on")
+    if progress and not fast:
+        for line in estimate(plan, plan.train.accumulate):
+            if line.stage in wanted:
+                say(str(line))
     facts = _old_facts(out)
     facts |= {
         "version": minicmdm.__version__,
