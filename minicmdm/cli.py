@@ -153,6 +153,9 @@ def _parser() -> Parser:
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")
     sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
     sub.add_argument(
+        "--data", help="a folder whose test.txt to answer; judges: `train --stage evaluator` (default: the toy world)"
+    )
+    sub.add_argument(
         "--protocol",
         help="t2m (text to motion), recon (the VAE and back), long (many prompts in a row) or mtt (timelines of "
         "three); the first two if not given",

@@ -237,13 +237,16 @@ def evaluate(arguments: argparse.Namespace) -> None:
     sampling = {"schedule": arguments.schedule, "num_steps": arguments.steps}
     sampling |= {"uncertainty": arguments.uncertainty, "guidance_scale": arguments.guidance}
     sampling = {key: value for key, value in sampling.items() if value is not None}
-    if arguments.quick and (asked or arguments.table):
+    if arguments.quick and (asked or arguments.table or arguments.data):
         named = [f"--{key.replace('_', '-')}" for key in asked] + ["--table"] * arguments.table
+        named += ["--data"] * bool(arguments.data)
         raise ValueError(f"--quick is a protocol of its own, with one flat list of numbers: leave out {named[0]}")
     if arguments.limit is not None and arguments.limit < 1:
         raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
     _one_thread()
+    from minicmdm.data.folders import load_dataset
     from minicmdm.evaluation import protocols
+    from minicmdm.evaluation.evaluators import load_bench
     from minicmdm.evaluation.quick import evaluate_quick
     from minicmdm.pipeline import MotionPipeline
 
@@ -256,6 +259,9 @@ def evaluate(arguments: argparse.Namespace) -> None:
         protocols.check(limit=arguments.limit, **asked)
         pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
         asked |= {"checkpoint": arguments.checkpoint, "limit": arguments.limit}
+        if arguments.data is not None:
+            asked |= {"data": load_dataset(arguments.data, "test")}
+            asked |= {"bench": load_bench(Path(arguments.checkpoint) / "evaluator")}
         result = protocols.evaluate(pipe, progress=True, **asked, **sampling)
         text = protocols.table(result)
     if out is not None:

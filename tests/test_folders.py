@@ -9,10 +9,11 @@ import pytest
 
 from minicmdm import cli
 from minicmdm.data.bvh_out import write_bvh
+from minicmdm.data.clips import Clip
 from minicmdm.data.dataset import make_clip
 from minicmdm.data.features import features_to_joints, joints_to_features
 from minicmdm.data.folders import babel_labels, load_dataset
-from minicmdm.data.imports import import_bvh, inspect_folder, read_csv, words_of
+from minicmdm.data.imports import import_bvh, inspect_folder, read_csv, split_clips, words_of
 
 REFERENCE = Path(__file__).parents[2] / "shared" / "reference" / "bvh"
 
@@ -110,6 +111,7 @@ WRONG = [  # how the folder is spoilt, what is said
     (put(TEXTS, b"he walks#x#one#two"), "line 1: start and end are seconds"),
     (put(TEXTS, b"he walks#x#0.0#0.0\nhe waves#x#3.0#1.0"), "line 2: from 3.0 to 1.0"),
     (put(TEXTS, b"he walks#x#-3.0#1.0"), "line 1: from -3.0"),
+    (put(TEXTS, b"he waves#x#8.0#9.0"), r"begins after the clip's end, at 6.00 seconds"),
     (put("train.json", b"{"), "no BABEL file"),
     (put("programs.jsonl", b"{}"), "no list of programs"),
     (put("programs.jsonl", b"no json"), "no list of programs"),
@@ -218,6 +220,14 @@ def test_what_cannot_be_imported_is_one_line(extra, spoilt, said, bvh_folder, tm
 
 
 @pytest.mark.skipif(not REFERENCE.is_dir(), reason="the ten reference BVH files are not here")
+def test_a_mirror_image_goes_where_its_original_goes():
+    names = [f"{number:06d}" for number in range(40)]
+    clips = [Clip(name, feature(40), ["a"], []) for name in [*names, *(f"M{name}" for name in names), "Mabel"]]
+    where = {clip.name: split for split, some in split_clips(clips).items() for clip in some}
+    assert len(where) == len(clips) and set(where.values()) == {"train", "val", "test"}
+    assert all(where[name] == where[f"M{name}"] for name in names)
+
+
 def test_from_ten_bvh_files_to_a_generated_motion(tmp_path, capsys):
     """One command each: a data set, a small model, a motion."""
     data, run, out = (str(tmp_path / name) for name in ("set", "run", "walk.bvh"))

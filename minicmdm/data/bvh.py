@@ -100,7 +100,7 @@ def _hierarchy(path: Path, words: list[str]):
     def take(count: int) -> list[str]:
         nonlocal at
         at += count
-        if at > len(words):
+        if count < 0 or at > len(words):
             raise ValueError(f"{path}: the hierarchy ends in the middle of a joint")
         return words[at - count : at]
 

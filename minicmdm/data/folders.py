@@ -92,10 +92,7 @@ def read_features(path: Path, what: str = "the file") -> np.ndarray:
     """Features (T, 263) as float32. FileNotFoundError; ValueError: pickled, cut short, another width, not finite."""
     if not path.is_file():
         raise FileNotFoundError(f"{what} {path} is not there")
-    try:
-        features = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError, OverflowError, SyntaxError) as error:
-        raise ValueError(f"{path} is no whole .npy file of numbers ({' '.join(str(error).split())})") from error
+    features = _array(path)
     if not isinstance(features, np.ndarray) or features.ndim != 2 or features.shape[1] != WIDTH or not len(features):
         shape = getattr(features, "shape", "an archive")
         raise ValueError(f"{path}: expected finite features of shape (T, {WIDTH}), got shape {shape}")
@@ -112,7 +109,7 @@ def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, i
     """
     if not path.is_file():
         raise FileNotFoundError(f"the captions {path} are not there")
-    whole, stretches = [], {}
+    whole, stretches, late = [], {}, 0
     for number, row in enumerate(_text(path).splitlines(), start=1):
         caption, _, rest = row.partition("#")
         if not caption.strip():
@@ -128,8 +125,11 @@ def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, i
             stretch = int(FPS * start), min(int(FPS * end), frames)
             if stretch[0] < stretch[1]:
                 stretches.setdefault(stretch, []).append(caption.strip())
+            late += stretch[0] >= stretch[1]
         else:
             raise ValueError(f"{path}, line {number}: from {start} to {end} seconds is no stretch of a motion")
+    if late and not whole and not stretches:
+        raise ValueError(f"{path}: what it tells of begins after the clip's end, at {frames / FPS:.2f} seconds")
     if not whole and not stretches:
         raise ValueError(f"{path} holds no caption: lines like 'a person walks.#a/DET person/NOUN#0.0#0.0' go there")
     return whole, stretches
@@ -222,7 +222,7 @@ def read_statistics(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
     paths = [folder / "Mean.npy", folder / "Std.npy"]
     if not all(path.is_file() for path in paths):
         return None
-    mean, std = (np.load(path, allow_pickle=False) for path in paths)
+    mean, std = (_array(path) for path in paths)
     for path, value in zip(paths, (mean, std)):
         if value.shape != (WIDTH,) or value.dtype.kind != "f" or not np.isfinite(value).all():
             raise ValueError(f"{path}: expected {WIDTH} finite numbers, got {value.dtype} of shape {value.shape}")
@@ -237,6 +237,13 @@ def fingerprint_of(clips: list[Clip]) -> str:
     for clip in clips:
         digest.update(clip.features.tobytes() + "\n".join([clip.name, *clip.captions]).encode())
     return digest.hexdigest()[:16]
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (ValueError, EOFError, OSError, MemoryError, OverflowError, SyntaxError) as error:
+        raise ValueError(f"{path} is no whole .npy file of numbers ({' '.join(str(error).split())})") from error
 
 
 def _text(path: Path) -> str:

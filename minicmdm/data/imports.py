@@ -76,11 +76,18 @@ def import_bvh(
 
 
 def split_clips(clips: list[Clip]) -> dict[str, list[Clip]]:
-    """Train, val and test: of every ten clips eight, one and one; all three the same where there are too few."""
-    if len(clips) < EVERY:
+    """Train, val and test: of every ten clips eight, one and one; all three the same where there are too few.
+
+    A clip named "M" and another's name is its mirror image, as in HumanML3D, and goes where that one goes: a model that
+    has been trained on one of them has seen the other.
+    """
+    names = {clip.name for clip in clips}
+    first = {clip.name: clip.name.removeprefix("M") if clip.name[1:] in names else clip.name for clip in clips}
+    order = {name: number for number, name in enumerate(dict.fromkeys(first.values()))}
+    if len(order) < EVERY:
         return dict.fromkeys(SPLIT_NAMES, clips)
-    kind = [{EVERY - 2: "val", EVERY - 1: "test"}.get(number % EVERY, "train") for number in range(len(clips))]
-    return {name: [clip for clip, own in zip(clips, kind) if own == name] for name in SPLIT_NAMES}
+    kind = {name: {EVERY - 2: "val", EVERY - 1: "test"}.get(number % EVERY, "train") for name, number in order.items()}
+    return {split: [clip for clip in clips if kind[first[clip.name]] == split] for split in SPLIT_NAMES}
 
 
 def words_of(name: str) -> str:

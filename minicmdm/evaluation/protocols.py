@@ -11,6 +11,9 @@ Under "metrics" each key of `metrics.ARROWS` holds four numbers:
 
 The floor is what a perfect model would score, for it too answers with another motion than the one in the test set: the
 truth's FID is 0, and nobody reaches it. "fields" holds the same four for each field of the oracle's accuracy.
+
+Real data has captions but no programs: nothing for the oracle to check, and nobody to act them out afresh. Then the
+oracle's rows are left out, and the floor is None.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
+from minicmdm.data.clips import MotionDataset
 from minicmdm.data.dataset import Clip, make_clip, toy_dataset, world_fingerprint
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
@@ -46,6 +50,7 @@ def evaluate(
     protocol: str | None = None,
     *,
     checkpoint: str = "",
+    data: MotionDataset | None = None,
     evaluator: str = JUDGE,
     repeats: int = 5,
     limit: int | None = None,
@@ -56,7 +61,8 @@ def evaluate(
 ) -> dict:
     """Run a protocol, "t2m", "recon", "long" or "mtt", or the first two when none is named, merged into one result.
 
-    `bench` holds the judges (default: the shipped ones), `checkpoint` is the name that the result carries, `sampling`
+    `bench` holds the judges (default: the shipped ones, who know the toy world alone), `data` is another test set (for
+    the first two protocols) in place of the toy world's, `checkpoint` is the name that the result carries, `sampling`
     goes to `text_to_motion` (schedule, num_steps, uncertainty, guidance_scale) or, with `compositions` and
     `prompts_each`, to `horizon.timelines`. ValueError for what cannot be asked.
     """
@@ -65,12 +71,14 @@ def evaluate(
     wanted = PROTOCOLS if protocol is None else (protocol,)
     if sampling and wanted == ("recon",):
         raise ValueError(f"reconstruction samples nothing, so {', '.join(sampling)} has no meaning there")
+    if data is not None and protocol in HORIZONS:
+        raise ValueError(f"the protocol {protocol} is made of toy programs: for other data take t2m or recon")
     bench, common = bench or load_bench(), {"evaluator": evaluator, "limit": limit, "progress": progress}
     parts = []
     if "t2m" in wanted:
-        parts.append(text_to_motion(pipe, bench, repeats=repeats, **common, **sampling))
+        parts.append(text_to_motion(pipe, bench, data=data, repeats=repeats, **common, **sampling))
     if "recon" in wanted:
-        parts.append(reconstruction(pipe, bench, **common))
+        parts.append(reconstruction(pipe, bench, data=data, **common))
     if protocol in HORIZONS:
         from minicmdm.evaluation.horizon import timelines  # which is made of what is here
 
@@ -113,6 +121,7 @@ def text_to_motion(
     pipe: MotionPipeline,
     bench: Bench,
     *,
+    data: MotionDataset | None = None,
     evaluator: str = JUDGE,
     schedule: str = "fss",
     num_steps: int = 20,
@@ -123,7 +132,7 @@ def text_to_motion(
     limit: int | None = None,
     progress: bool = True,
 ) -> dict:
-    """Answer every test clip of the toy world, or the first `limit`, `repeats` times; see the head of this module.
+    """Answer every test clip of `data` or the toy world, or the first `limit`, `repeats` times; see the module's head.
 
     Each repeat draws a caption and a seed for each clip, and the pools of 32. Motions get the length of their clip, as
     everywhere in this field. MultiModality is taken once: 32 texts, 10 motions each; the truth has one motion a text
@@ -133,43 +142,53 @@ def text_to_motion(
     ask = dict(schedule=schedule, num_steps=num_steps, uncertainty=uncertainty, guidance_scale=guidance_scale)
     ask |= {} if solver is None else {"solver": solver}
     pipe(["a person stands"], [4], seed=[0], **ask)  # what the pipeline refuses, it refuses here and not in a minute
-    clips = toy_dataset("test", limit, progress).clips
+    clips, told, fingerprint = _test_set(data, limit, progress)
     judges = [bench[evaluator], bench["clip_essential"]]
-    again = [_afresh(clip, k) for k, clip in enumerate(tqdm(clips, "making them afresh", disable=not progress))]
-    seen = {"gt": _see(judges, clips), "floor": _see(judges, again)}
+    seen = {"gt": _see(judges, clips)}
+    if told:
+        bar = tqdm(clips, "making them afresh", disable=not progress)
+        seen["floor"] = _see(judges, [_afresh(clip, k) for k, clip in enumerate(bar)])
     rows: dict[str, list[dict[str, float]]] = {"model": [], "gt": [], "floor": []}
-    batches = repeats * -(-len(clips) // AT_ONCE) + TEXTS * SAMPLES // AT_ONCE
+    texts = min(TEXTS, len(clips))
+    batches = repeats * -(-len(clips) // AT_ONCE) + -(-texts * SAMPLES // AT_ONCE)
     with tqdm(desc="answering", total=batches, unit="batch", disable=not progress) as bar:
         for repeat in range(repeats):
             rng = np.random.default_rng(repeat)
             asked = [replace(clip, captions=[clip.captions[rng.integers(len(clip.captions))]]) for clip in clips]
             seen["model"] = _see(judges, _answers(pipe, asked, rng, ask, bar))
             draw = int(rng.integers(2**31))  # the same pools and pairs for all three
-            for name in rows:
+            for name in seen:
                 rows[name].append(_score(seen[name], seen["model"].texts, seen["gt"], clips, draw))
             if repeat == 0:
-                asked = [asked[i] for i in rng.choice(len(asked), TEXTS, replace=False) for _ in range(SAMPLES)]
-                again = [_afresh(clip, len(clips) + k) for k, clip in enumerate(asked)]
-                some = [_embed(judges[0], made)[1] for made in (_answers(pipe, asked, rng, ask, bar), again)]
-                some = [points.reshape(TEXTS, SAMPLES, -1) for points in some]
+                asked = [asked[i] for i in rng.choice(len(asked), texts, replace=False) for _ in range(SAMPLES)]
+                made = [_answers(pipe, asked, rng, ask, bar)]
+                made += [[_afresh(clip, len(clips) + k) for k, clip in enumerate(asked)]] * told
+                some = [_embed(judges[0], motions)[1].reshape(texts, SAMPLES, -1) for motions in made]
                 spread = [metrics.multimodality(points, np.random.default_rng(draw)) for points in some]
                 modes = _entry(spread[:1], floor=spread[1:])
     summary = {key: _entry(*([row[key] for row in rows[name]] for name in rows)) for key in rows["gt"][0]}
     fields = {key: summary.pop(key) for key in FIELDS if key in summary}
-    facts = {"protocol": "t2m", "evaluator": evaluator, "clips": len(clips), "fingerprint": world_fingerprint()}
+    facts = {"protocol": "t2m", "evaluator": evaluator, "clips": len(clips), "pool": min(POOL, len(clips))}
+    facts["fingerprint"] = fingerprint
     return {**facts, "repeats": repeats, **ask, "metrics": summary | {"multimodality": modes}, "fields": fields}
 
 
 def reconstruction(
-    pipe: MotionPipeline, bench: Bench, *, evaluator: str = JUDGE, limit: int | None = None, progress: bool = True
+    pipe: MotionPipeline,
+    bench: Bench,
+    *,
+    data: MotionDataset | None = None,
+    evaluator: str = JUDGE,
+    limit: int | None = None,
+    progress: bool = True,
 ) -> dict:
-    """Send every test clip, or the first `limit`, through the VAE and back: what its latents can hold at all.
+    """Send the test clips, as in `text_to_motion`, through the VAE and back: what can its latents hold at all?
 
     Errors are means over frames, in mm (`accel_mm` in mm / frame^2). Posterior means are used and nothing is drawn, so
     one pass is all; and as the answer is the very motion, the truth is what a perfect VAE scores and `floor` is None.
     """
     check("recon", evaluator, limit=limit)
-    clips = toy_dataset("test", limit, progress).clips
+    clips, told, fingerprint = _test_set(data, limit, progress)
     bar = tqdm(clips, "rebuilding", disable=not progress)
     rebuilt = [replace(clip, features=pipe.reconstruct(clip.features)) for clip in bar]
     truth = [replace(clip, features=clip.features[: len(one.features)]) for clip, one in zip(clips, rebuilt)]
@@ -177,15 +196,16 @@ def reconstruction(
     jump = np.average([metrics.accel(x, y) for x, y in zip(a, b)], weights=[len(x) - 2 for x in a])
     together = np.concatenate(a), np.concatenate(b)  # (frames of all clips,22,3)
     found, real = (_see([bench[evaluator]], some) for some in (rebuilt, truth))
-    right, own = (metrics.segment_accuracy([c.program for c in clips], seen.programs) for seen in (found, real))
     measured = {
         "mpjpe_mm": _entry([1000 * metrics.mpjpe(*together)], [0.0]),
         "pa_mpjpe_mm": _entry([1000 * metrics.pa_mpjpe(*together)], [0.0]),
         "accel_mm": _entry([1000 * jump], [0.0]),
         "recon_fid": _entry([metrics.frechet_distance(found.motions[0], real.motions[0])], [0.0]),
-        "recon_oracle_accuracy": _entry([right], [own]),
     }
-    facts = {"protocol": "recon", "evaluator": evaluator, "clips": len(clips), "fingerprint": world_fingerprint()}
+    if told:
+        right, own = (metrics.segment_accuracy([c.program for c in clips], seen.programs) for seen in (found, real))
+        measured["recon_oracle_accuracy"] = _entry([right], [own])
+    facts = {"protocol": "recon", "evaluator": evaluator, "clips": len(clips), "fingerprint": fingerprint}
     return {**facts, "repeats": 1, "schedule": None, "metrics": measured}
 
 
@@ -203,20 +223,30 @@ def table(result: Mapping) -> str:
     return "\n".join([", ".join(words), "", *lines])
 
 
+def _test_set(data: MotionDataset | None, limit: int | None, progress: bool) -> tuple[list[Clip], bool, str]:
+    """The clips to answer, whether they have programs, and the fingerprint of where they are from."""
+    if data is None:
+        return toy_dataset("test", limit, progress).clips, True, world_fingerprint()
+    clips = data.clips[:limit]
+    if len(clips) < 4:
+        raise ValueError(f"a test set needs at least 4 clips to be told apart, and {len(clips)} came")
+    return clips, all(clip.program for clip in clips), data.fingerprint
+
+
 @dataclass(frozen=True)
 class Seen:
     """What is known of N clips: texts and motions (N,E) as each judge places them, what was done, how much it slid."""
 
     texts: list[np.ndarray]
     motions: list[np.ndarray]
-    programs: list[Program]
+    programs: list[Program]  # none, where nobody knows what was asked
     skating: float
 
 
 def _see(judges: list[Evaluator], clips: list[Clip]) -> Seen:
     texts, motions = zip(*[_embed(judge, clips) for judge in judges])
     joints = [features_to_joints(clip.features) for clip in clips]
-    programs = [tuple(read_motion(one)) for one in joints]
+    programs = [tuple(read_motion(one)) for one in joints] if all(clip.program for clip in clips) else []
     return Seen(texts, motions, programs, float(np.mean([metrics.skating_ratio(one) for one in joints])))
 
 
@@ -247,16 +277,21 @@ def _score(seen: Seen, texts: list[np.ndarray], truth: Seen, clips: list[Clip], 
     rng = np.random.default_rng(draw)
     asked = [clip.program for clip in clips]
     heldout = [(clip.program, found) for clip, found in zip(clips, seen.programs) if clip.kind == "pairs"]
+    pool = min(POOL, len(clips))
+    right = {}
+    if seen.programs:
+        right["oracle_accuracy"] = metrics.segment_accuracy(asked, seen.programs)
+    if heldout:
+        right["oracle_accuracy_heldout"] = metrics.segment_accuracy(*zip(*heldout))
     return {
-        "oracle_accuracy": metrics.segment_accuracy(asked, seen.programs),
-        "oracle_accuracy_heldout": metrics.segment_accuracy(*zip(*heldout)),
-        **dict(zip(("r_at_1", "r_at_2", "r_at_3"), metrics.r_precision(texts[0], seen.motions[0], POOL, rng))),
+        **right,
+        **dict(zip(("r_at_1", "r_at_2", "r_at_3"), metrics.r_precision(texts[0], seen.motions[0], pool, rng))),
         "mm_dist": metrics.mm_distance(texts[0], seen.motions[0]),
         "fid": metrics.frechet_distance(seen.motions[0], truth.motions[0]),
         "diversity": metrics.diversity(seen.motions[0], rng),
         "clip_score": metrics.clip_score(texts[1], seen.motions[1]),
         "skating_ratio": seen.skating,
-        **metrics.field_accuracy(asked, seen.programs),
+        **(metrics.field_accuracy(asked, seen.programs) if seen.programs else {}),
     }
 
 

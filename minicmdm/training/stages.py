@@ -94,12 +94,12 @@ def train(
     if stage != "all" and (missing := [file for file in NEEDS[stage] if not (out / file).is_file()]):
         raise FileNotFoundError(f"{out} holds no {missing[0]}: stage {stage} needs the stages before it")
     team.wait()
-    out.mkdir(parents=True, exist_ok=True)
     if not team.first:
         say = _silent
 
     say("reading the data")
     train_set, val_set = _datasets(data, fast, progress)
+    out.mkdir(parents=True, exist_ok=True)  # not sooner: what is wrong with the data leaves no folder behind
     say(f"{len(train_set.clips)} clips to train on, {len(val_set.clips)} to validate on")
     if progress and not fast:
         for line in estimate(plan, plan.train.accumulate):
