@@ -109,6 +109,11 @@ def in_set(name, content):
     return data(lambda set: (set / name).write_bytes(content if isinstance(content, bytes) else content.encode()))
 
 
+def program(**record):
+    """A data set whose first clip's program is told wrongly."""
+    return in_set("programs.jsonl", json.dumps({"name": "0", **record}))
+
+
 BVH = """HIERARCHY
 ROOT hips
 {
@@ -224,6 +229,9 @@ ROWS = {
     "card whose files lead out": (card(lambda told: told["files"].update({"../x": "0"})), MINE, "under 'files'"),
     "card without a preset": (card(lambda told: told.pop("preset")), MINE, "describes no preset"),
     "card with a preset of words": (card(lambda told: told.update(preset="big")), MINE, "describes no preset"),
+    "card of no heads": (card(lambda told: told["preset"]["dit"].update(heads=0)), MINE, "card.json"),
+    "card of a monstrous size": (card(lambda told: told["preset"]["dit"].update(dim=10**12)), MINE, "cannot be built"),
+    "checkpoint name too long": (nothing, [*MINE[:-1], "c" * 300], "too long"),
     "folder that is empty": (folder("mine"), MINE, "no card.json"),
     "training that has not ended": (put("mine/state_tmr.safetensors", ""), MINE, "--resume"),
     "stream from a cut checkpoint": (
@@ -310,6 +318,36 @@ ROWS = {
         TRAIN,
         "Std.npy",
     ),
+    "mean in an archive": (
+        data(lambda set: (np.savez(open(set / "Mean.npy", "wb"), a=1.0), np.save(set / "Std.npy", np.ones(263)))),
+        TRAIN,
+        "Mean.npy is an archive",
+    ),
+    "features beyond float32": (features(np.full((64, 263), 1e300)), TRAIN, "frame 0 is not"),
+    "caption without an end": (in_set("texts/1.txt", "he walks#x#0.0#inf\n"), TRAIN, "from 0.0 to inf seconds"),
+    "a split that is a folder": (
+        data(lambda set: ((set / "train.txt").unlink(), (set / "train.txt").mkdir())),
+        TRAIN,
+        "no train.txt",
+    ),
+    "a clip's name too long": (in_set("train.txt", "a" * 300), TRAIN, "too long"),
+    "programs of colours": (program(asked=[{"colour": 1}]), TRAIN, "is no list of programs"),
+    "programs of nothing": (program(labels=None), TRAIN, "is no list of programs"),
+    "program labels in words": (program(labels=[["a", "b", "walk"]]), TRAIN, "is no list of programs"),
+    "program labels of two": (program(labels=[[0, 40]]), TRAIN, "is no list of programs"),
+    "program labels of numbers": (program(labels=[[0, 40, 5]]), TRAIN, "is no list of programs"),
+    "programs nested without end": (in_set("programs.jsonl", "[" * 100000), TRAIN, "is no list of programs"),
+    "a BABEL label without an end": (
+        in_set(
+            "train.json",
+            '{"1": {"frame_ann": {"labels": [{"start_t": 0, "end_t": Infinity, "raw_label": "walk"}]}}}',
+        ),
+        TRAIN,
+        "is no BABEL file",
+    ),
+    "run inside a file": (data(), [*TRAIN, "--out", "set/train.txt/run"], "Not a directory"),
+    "run's name too long": (data(), [*TRAIN, "--out", "r" * 300], "too long"),
+    "device without numbers": (data(), [*TRAIN, "--device", "meta"], "no device 'meta'"),
     "data in a file": (put("set", "x"), TRAIN, "no train.txt"),
     "data nowhere": (nothing, TRAIN, "no train.txt"),
     # train: options
@@ -368,6 +406,12 @@ ROWS = {
     "bvh good and bad": (good_bvh(bvh("Frames: 2", "Frames: 9")), IMPORT, "a.bvh says"),
     "bvh map is a folder": (good_bvh(folder("map")), [*IMPORT, "--map", "map"], "no joint map"),
     "bvh map is a list": (good_bvh(put("map.json", "[1]")), [*IMPORT, "--map", "map.json"], "is no joint map"),
+    "bvh map nested without end": (
+        good_bvh(put("map.json", "[" * 100000)),
+        [*IMPORT, "--map", "map.json"],
+        "is no joint map",
+    ),
+    "bvh that is a folder": (folder("bvh/a.bvh"), IMPORT, "no file bvh/a.bvh"),
     "bvh captions not UTF-8": (
         good_bvh(put("c.csv", b"name,caption\nwalk,caf\xe9\n")),
         [*IMPORT, "--captions", "c.csv"],

@@ -93,13 +93,15 @@ def read_features(path: Path, what: str = "the file") -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{what} {path} is not there")
     features = _array(path)
-    if not isinstance(features, np.ndarray) or features.ndim != 2 or features.shape[1] != WIDTH or not len(features):
-        shape = getattr(features, "shape", "an archive")
-        raise ValueError(f"{path}: expected finite features of shape (T, {WIDTH}), got shape {shape}")
+    if features.ndim != 2 or features.shape[1] != WIDTH or not len(features):
+        raise ValueError(f"{path}: expected finite features of shape (T, {WIDTH}), got shape {features.shape}")
+    if features.dtype.kind in "fiu":
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
+            features = features.astype(np.float32)
     if features.dtype.kind not in "fiu" or not np.isfinite(features).all():
         bad = np.argwhere(~np.isfinite(features))[0, 0] if features.dtype.kind == "f" else "0"
         raise ValueError(f"{path}: expected finite features, but frame {bad} is not, or it holds {features.dtype}")
-    return features.astype(np.float32)
+    return features
 
 
 def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, int], list[str]]]:
@@ -121,7 +123,7 @@ def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, i
             raise ValueError(f"{path}, line {number}: start and end are seconds, got {'#'.join(marks)}") from None
         if start == end == 0:
             whole.append(caption.strip())
-        elif 0 <= start < end:
+        elif 0 <= start < end < math.inf:
             stretch = int(FPS * start), min(int(FPS * end), frames)
             if stretch[0] < stretch[1]:
                 stretches.setdefault(stretch, []).append(caption.strip())
@@ -149,7 +151,7 @@ def babel_labels(path: Path) -> dict[str, list[tuple[int, int, str]]]:
             rows = [(int(FPS * float(x["start_t"])), int(FPS * float(x["end_t"])), x) for x in labels]
             rows = sorted((a, b, str(x.get("proc_label") or x["raw_label"]).strip()) for a, b, x in rows if a < b)
             found[str(entry.get("name", name))] = rows
-    except (json.JSONDecodeError, AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
         raise ValueError(f"{path} is no BABEL file ({type(error).__name__}: {error})") from error
     return found
 
@@ -209,8 +211,12 @@ def clip_records(folder: Path, split: str) -> dict[str, dict]:
     """What is known of clips beside features and captions: programs of the toy world, or BABEL's labels."""
     if (path := folder / "programs.jsonl").is_file():
         try:
-            return {record["name"]: record for record in map(json.loads, _text(path).splitlines())}
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            records = {record["name"]: record for record in map(json.loads, _text(path).splitlines())}
+            for record in records.values():  # tried here, where the file can be named
+                _program(record.get("asked")), _program(record.get("realised"))
+                [(range(start, end), text.strip()) for start, end, text in record.get("labels", [])]
+            return records
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise ValueError(f"{path} is no list of programs ({error})") from error
     if (path := folder / f"{split}.json").is_file():
         return {name: {"labels": labels} for name, labels in babel_labels(path).items()}
@@ -241,9 +247,12 @@ def fingerprint_of(clips: list[Clip]) -> str:
 
 def _array(path: Path) -> np.ndarray:
     try:
-        return np.load(path, allow_pickle=False)
+        array = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError, MemoryError, OverflowError, SyntaxError) as error:
         raise ValueError(f"{path} is no whole .npy file of numbers ({' '.join(str(error).split())})") from error
+    if not isinstance(array, np.ndarray):
+        raise ValueError(f"{path} is an archive (.npz), and one array (.npy) was expected")
+    return array
 
 
 def _text(path: Path) -> str:

@@ -109,7 +109,7 @@ def load_map(source: str | Path) -> dict[str, Place]:
             name: where if isinstance(where, str) else (str(where[0]), str(where[1]), float(where[2]))
             for name, where in entries.items()
         }
-    except (ValueError, AttributeError, TypeError, IndexError, KeyError) as error:
+    except (ValueError, AttributeError, TypeError, IndexError, KeyError, RecursionError) as error:
         raise ValueError(f"{path} is no joint map: expected our names -> a name or [a, b, share] ({error})") from error
 
 

@@ -245,7 +245,7 @@ def load_teacher(folder: Path, preset: Preset) -> MotionTeacher:
 def _build(model: type[nn.Module], config: object, folder: Path) -> nn.Module:
     try:
         return model(config)
-    except (TypeError, ValueError, RuntimeError, MemoryError) as error:
+    except (TypeError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ValueError(
             f"{folder / 'card.json'} describes a {model.__name__} that cannot be built: {error}"
         ) from error
@@ -255,5 +255,5 @@ def read_preset(card: dict, folder: Path) -> Preset:
     """The preset that a card describes (ValueError if its fields are not those of this version)."""
     try:
         return Preset.from_dict(card["preset"])
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
+    except (TypeError, KeyError, ValueError, ArithmeticError, AttributeError) as error:
         raise ValueError(f"{folder / 'card.json'} describes no preset that this version knows: {error}") from error

@@ -38,7 +38,7 @@ class Team:
         self.workers = workers
         try:
             self.device = torch.device(device)
-            torch.empty(1, device=self.device)
+            torch.zeros(1, device=self.device).item()  # "meta" has tensors, but no numbers
         except (RuntimeError, AssertionError) as error:
             raise ValueError(f"no device {device!r} on this machine: {str(error).splitlines()[0]}") from error
         self.rank, self.size, self._accelerator = 0, 1, None
