@@ -16,13 +16,12 @@ from minicmdm.evaluation.evaluators import (
     BENCH,
     Evaluator,
     EvaluatorConfig,
-    draw_pairs,
     embed,
     load_bench,
-    near_miss,
     save_bench,
 )
 from minicmdm.evaluation.metrics import r_precision
+from minicmdm.evaluation.pairs import draw_pairs, near_miss
 from minicmdm.models.tmr import contrastive_loss
 from minicmdm.training.checkpoints import checksum, load_tensors, save_tensors
 

@@ -146,8 +146,8 @@ def text_to_motion(
     judges = [bench[evaluator], bench["clip_essential"]]
     seen = {"gt": _see(judges, clips)}
     if told:
-        bar = tqdm(clips, "making them afresh", disable=not progress)
-        seen["floor"] = _see(judges, [_afresh(clip, k) for k, clip in enumerate(bar)])
+        again = enumerate(tqdm(clips, "making them afresh", disable=not progress))
+        seen["floor"] = _see(judges, [_afresh(clip, k) for k, clip in again])
     rows: dict[str, list[dict[str, float]]] = {"model": [], "gt": [], "floor": []}
     texts = min(TEXTS, len(clips))
     batches = repeats * -(-len(clips) // AT_ONCE) + -(-texts * SAMPLES // AT_ONCE)
@@ -278,9 +278,7 @@ def _score(seen: Seen, texts: list[np.ndarray], truth: Seen, clips: list[Clip], 
     asked = [clip.program for clip in clips]
     heldout = [(clip.program, found) for clip, found in zip(clips, seen.programs) if clip.kind == "pairs"]
     pool = min(POOL, len(clips))
-    right = {}
-    if seen.programs:
-        right["oracle_accuracy"] = metrics.segment_accuracy(asked, seen.programs)
+    right = {"oracle_accuracy": metrics.segment_accuracy(asked, seen.programs)} if seen.programs else {}
     if heldout:
         right["oracle_accuracy_heldout"] = metrics.segment_accuracy(*zip(*heldout))
     return {

@@ -21,7 +21,8 @@ from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints, joints_to_features, mirror_joints
 from minicmdm.data.programs import FIELDS, Program
 from minicmdm.evaluation import metrics
-from minicmdm.evaluation.evaluators import embed, load_bench, near_miss
+from minicmdm.evaluation.evaluators import embed, load_bench
+from minicmdm.evaluation.pairs import near_miss
 from minicmdm.evaluation.protocols import text_to_motion
 from minicmdm.evaluation.small import KEYS, PROMPTS, Row, micro
 from minicmdm.motion import Motion
