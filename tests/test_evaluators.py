@@ -11,7 +11,7 @@ import torch
 
 from minicmdm.data.dataset import Clip, MotionDataset, toy_dataset
 from minicmdm.data.programs import FIELDS, HELDOUT_PAIRS, Segment, pairs_of, sample_program
-from minicmdm.evaluation import evaluators
+from minicmdm.evaluation import evaluators, pairs
 from minicmdm.evaluation.evaluators import (
     BENCH,
     Evaluator,
@@ -247,7 +247,7 @@ def run(tmp_path_factory):
         shape = replace(TINY[name], width=32, embed_dim=16)
         settings = dict(steps=steps, batch=12, lr=lr, seed=seed, progress=False)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(evaluators.grammar, "caption", plain)
+            patch.setattr(pairs.grammar, "caption", plain)
             return evaluators.train_evaluator(shape, data, world(99), out, **settings, **more)
 
     return train
