@@ -180,8 +180,8 @@ def schedule(arguments: argparse.Namespace) -> None:
 
 def train(arguments: argparse.Namespace) -> None:
     """`minicmdm train`: all stages, or one of them."""
-    if arguments.threads < 1:
-        raise ValueError(f"--threads must be at least 1, and {arguments.threads} came")
+    if not 1 <= arguments.threads <= 1024:
+        raise ValueError(f"--threads must be at least 1 and at most 1024, and {arguments.threads} came")
     if arguments.seed is not None and arguments.seed < 0:
         raise ValueError(f"--seed must not be negative, and {arguments.seed} came")
     if arguments.accumulate is not None and arguments.accumulate < 1:

@@ -8,10 +8,14 @@ from __future__ import annotations
 
 import os
 import tempfile
+import tokenize
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+# All that numpy raises for a file that is no whole .npy: its header is parsed as Python text.
+NO_NPY = (ValueError, EOFError, OverflowError, SyntaxError, MemoryError, TypeError, RecursionError, tokenize.TokenError)
 
 
 @contextmanager

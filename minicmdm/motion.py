@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from minicmdm.files import check_output, whole_file
+from minicmdm.files import NO_NPY, check_output, whole_file
 
 ENDINGS = (".npy", ".gif", ".html", ".bvh")
 
@@ -105,7 +105,7 @@ def load_joints(path: str | Path) -> np.ndarray:
     try:
         # Mapped, so that a header which promises more than the file holds is refused before memory is asked for.
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    except (ValueError, EOFError, OverflowError, SyntaxError, MemoryError, UnicodeError) as error:
+    except NO_NPY as error:
         raise ValueError(f"{path} is not a whole .npy file of numbers ({' '.join(str(error).split())})") from error
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{path} is an archive (.npz): an .npy file of joints (T,22,3) was expected")

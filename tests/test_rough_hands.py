@@ -161,6 +161,13 @@ def state(write):
     return build
 
 
+def safetensors(header):
+    """The bytes of a safetensors file of no tensors, with a header of its own."""
+    raw = json.dumps(header).encode()
+    return len(raw).to_bytes(8, "little") + raw
+
+
+OPEN_HEADER = b"\x93NUMPY\x01\x00\x08\x00{'descr'"
 LINES = "1\ta person walks\n2\ta person jumps\n"
 GENERATE = ["generate", "a person walks", "--out", "new.npy", "--checkpoint", "toy"]
 STREAM = ["stream", "plan.tsv", "--out", "new.npy", "--checkpoint", "toy"]
@@ -215,6 +222,16 @@ ROWS = {
     "weights empty": (overwrite("dit.safetensors", b""), MINE, "not a whole safetensors"),
     "weights cut in the header": (cut("vae.safetensors", 40), MINE, "not a whole safetensors"),
     "weights boast of a header": (overwrite("vae.safetensors", b"\xff" * 64), MINE, "not a whole safetensors"),
+    "weights with a note of nothing": (
+        overwrite("dit.safetensors", safetensors({"__metadata__": None})),
+        MINE,
+        "not a whole safetensors",
+    ),
+    "weights with a note without end": (
+        overwrite("dit.safetensors", safetensors({"__metadata__": {"note": "[" * 100000}})),
+        MINE,
+        "not a whole safetensors",
+    ),
     "weights of another part": (
         checkpoint(lambda mine: shutil.copy(mine / "vae.safetensors", mine / "dit.safetensors")),
         MINE,
@@ -269,6 +286,7 @@ ROWS = {
     ),
     # inspect and schedule
     "inspect a pickle": (put("a.npy", pickle.dumps(Bomb())), ["inspect", "a.npy"], "not a whole .npy"),
+    "inspect a cut header": (put("a.npy", OPEN_HEADER), ["inspect", "a.npy"], "not a whole .npy"),
     "inspect nothing": (nothing, ["inspect"], "FILE"),
     "inspect two": (nothing, ["inspect", "a.npy", "b.npy"], "unrecognized arguments"),
     "inspect one joint short": (
@@ -297,6 +315,7 @@ ROWS = {
     "features of no frames": (features(np.zeros((0, 263))), TRAIN, "got shape (0, 263)"),
     "features of bools": (features(np.zeros((64, 263), bool)), TRAIN, "bool"),
     "features pickled": (features(np.array([Bomb()], object), allow_pickle=True), TRAIN, "no whole .npy"),
+    "features with a cut header": (in_set("new_joint_vecs/1.npy", OPEN_HEADER), TRAIN, "no whole .npy"),
     "features in an archive": (
         data(lambda set: np.savez(open(set / "new_joint_vecs" / "1.npy", "wb"), a=np.zeros((64, 263)))),
         TRAIN,
@@ -355,6 +374,7 @@ ROWS = {
     "accumulate below zero": (data(), [*TRAIN, "--accumulate", "-2"], "--accumulate must be at least 1"),
     "workers below zero": (data(), [*TRAIN, "--workers", "-1"], "workers must not be negative"),
     "threads below zero": (data(), [*TRAIN, "--threads", "-4"], "--threads must be at least 1"),
+    "threads beyond any integer": (data(), [*TRAIN, "--threads", "9" * 40], "--threads must be at least 1"),
     "training seed in words": (data(), [*TRAIN, "--seed", "x"], "--seed"),
     "device unknown": (data(), [*TRAIN, "--device", "abacus"], "no device 'abacus'"),
     "device empty": (data(), [*TRAIN, "--device", ""], "no device ''"),

@@ -28,6 +28,7 @@ import numpy as np
 from minicmdm.data.clips import Clip, MotionDataset, feature_statistics
 from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES, Program, Segment
 from minicmdm.data.skeleton import FPS
+from minicmdm.files import NO_NPY
 
 WIDTH = 263
 SPLIT_NAMES = ("train", "val", "test")
@@ -248,7 +249,7 @@ def fingerprint_of(clips: list[Clip]) -> str:
 def _array(path: Path) -> np.ndarray:
     try:
         array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError, OverflowError, SyntaxError) as error:
+    except (OSError, *NO_NPY) as error:
         raise ValueError(f"{path} is no whole .npy file of numbers ({' '.join(str(error).split())})") from error
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{path} is an archive (.npz), and one array (.npy) was expected")

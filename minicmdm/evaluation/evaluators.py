@@ -273,6 +273,6 @@ def load_bench(folder: str | Path = "toy-bench-1") -> dict[str, Evaluator]:
                 raise ValueError(f"{path.name} is not the file of card.json: it was changed or mixed in")
             bench[name] = Evaluator(EvaluatorConfig(**note["config"]), note["words"]).eval().requires_grad_(False)
             load_weights(bench[name], path)
-    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError) as error:
         raise ValueError(f"{folder} holds no evaluators that this version can read: {error}") from error
     return bench

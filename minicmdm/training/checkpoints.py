@@ -72,7 +72,7 @@ def load_tensors(path: str | Path) -> tuple[dict[str, Tensor], object]:
         tensors = safetensors.torch.load(raw)
         header = json.loads(raw[8 : 8 + int.from_bytes(raw[:8], "little")])
         note = json.loads(header.get("__metadata__", {}).get("note", "null"))
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, AttributeError, RecursionError) as error:
         size = path.stat().st_size
         raise ValueError(
             f"{path} ({size} bytes) is not a whole safetensors file: it is cut short or of another kind ({error})"
