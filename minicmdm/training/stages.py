@@ -136,4 +136,5 @@ def _datasets(data: str | Path | None, fast: bool, progress: bool) -> tuple[Moti
 
 def _old_facts(out: Path) -> dict:
     facts = checkpoints.read_card(out) if (out / "card.json").is_file() else {}
-    return {key: dict(facts.get(key, {})) for key in ("metrics", "seconds", "commands", "parameters")}
+    groups = {key: facts.get(key) for key in ("metrics", "seconds", "commands", "parameters")}
+    return {key: dict(group) if isinstance(group, dict) else {} for key, group in groups.items()}
