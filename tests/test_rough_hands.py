@@ -530,3 +530,38 @@ def test_on_a_full_disk_the_old_file_survives(name, here, capsys, monkeypatch):
     line = refused([*arguments, "--steps", "2", *short, "--force"], capsys)
     assert "No space left on device" in line
     assert digest(here) == before and Path(old).read_text() == "mine"
+
+
+def test_on_a_full_disk_the_old_data_set_survives(here, capsys, monkeypatch):
+    good_bvh()()
+    data()()
+    before, real = digest(here), np.save
+
+    def full(path, array, **how):
+        if "Mean" in str(path):  # the last but one that is written
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(path, array, **how)
+
+    monkeypatch.setattr("minicmdm.data.folders.np.save", full)
+    assert "No space left on device" in refused([*IMPORT, "--force"], capsys)
+    assert digest(here) == before
+
+
+def test_a_training_that_a_full_disk_stopped_goes_on(here, capsys, monkeypatch):
+    from minicmdm.training import stages
+
+    data()()
+    monkeypatch.setattr(stages, "FAST", {"evaluator_steps": 2, "evaluator_batch": 2})
+    order, real, left = [*TRAIN, "--stage", "evaluator"], os.fsync, [1]
+
+    def full(number):
+        if not left:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        left.pop()
+        real(number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("minicmdm.files.os.fsync", full)
+        assert "No space left on device" in refused(order, capsys)
+    assert not list(here.rglob(".minicmdm-*"))  # no half of a file
+    assert cli.main([*order, "--resume"]) == 0

@@ -161,39 +161,43 @@ def fit(
     bar = tqdm(total=config.steps, initial=start, desc=f"train {name}", disable=quiet, mininterval=1.0)
     turns = (step * config.accumulate + part for step in range(start, config.steps) for part in share)
     drawn = team.ahead(lambda turn: _drawn(step_key(config.seed, turn), draw), turns)
-    for step in range(start, config.steps):
-        models.zero_grad(set_to_none=True)
-        total = torch.zeros((), device=team.device)
-        for key, batch, generator in islice(drawn, len(share)):
-            with torch.random.fork_rng(devices=[]):  # layers' own dropout draws from the global generator: key it too
-                torch.manual_seed(key)
-                value, numbers = loss(models, batch, generator)
-            (value / config.accumulate).backward()
-            total += value.detach() / config.accumulate
-        team.add_up([total, *(weight.grad for weight in weights if weight.grad is not None)])
-        norm = nn.utils.clip_grad_norm_(weights, config.grad_clip)
-        if not torch.isfinite(norm):
-            raise ValueError(f"training {name}: the gradient at step {step} is not finite; try a lower learning rate")
-        for kind, optimizer in optimizers.items():
-            optimizer.param_groups[0]["lr"] = learning_rate(config, step) / config.lr * tops[kind]
-            optimizer.step()
-        update_ema(ema, models, config.ema, step)
+    with bar:  # closed whatever happens, so that what is said next has a line of its own
+        for step in range(start, config.steps):
+            models.zero_grad(set_to_none=True)
+            total = torch.zeros((), device=team.device)
+            for key, batch, generator in islice(drawn, len(share)):
+                with torch.random.fork_rng(
+                    devices=[]
+                ):  # layers' own dropout draws from the global generator: key it too
+                    torch.manual_seed(key)
+                    value, numbers = loss(models, batch, generator)
+                (value / config.accumulate).backward()
+                total += value.detach() / config.accumulate
+            team.add_up([total, *(weight.grad for weight in weights if weight.grad is not None)])
+            norm = nn.utils.clip_grad_norm_(weights, config.grad_clip)
+            if not torch.isfinite(norm):
+                raise ValueError(
+                    f"training {name}: the gradient at step {step} is not finite; try a lower learning rate"
+                )
+            for kind, optimizer in optimizers.items():
+                optimizer.param_groups[0]["lr"] = learning_rate(config, step) / config.lr * tops[kind]
+                optimizer.step()
+            update_ema(ema, models, config.ema, step)
 
-        done, last = step + 1, step + 1 == config.steps
-        if done % config.log_every == 0 or last:
-            row = {"step": done, "loss": float(total), **numbers, "grad_norm": float(norm)}
-            table.append({**row, "lr": learning_rate(config, step)})
-            bar.set_postfix(
-                {"loss": f"{row['loss']:.4f}", **{k: f"{v:.4g}" for k, v in metrics.items()}}, refresh=False
-            )
-        if done % config.validate_every == 0 or last:
-            metrics = validate(ema) if team.first else {}
-            table.append({"step": done, **metrics})
-        if team.first and (done % config.save_every == 0 or last):
-            _save(state_file, models, ema, optimizers, done, time.perf_counter() - clock, table, metrics, identity)
-            write_table(table_file, table)
-        bar.update(1)
-    bar.close()
+            done, last = step + 1, step + 1 == config.steps
+            if done % config.log_every == 0 or last:
+                row = {"step": done, "loss": float(total), **numbers, "grad_norm": float(norm)}
+                table.append({**row, "lr": learning_rate(config, step)})
+                bar.set_postfix(
+                    {"loss": f"{row['loss']:.4f}", **{k: f"{v:.4g}" for k, v in metrics.items()}}, refresh=False
+                )
+            if done % config.validate_every == 0 or last:
+                metrics = validate(ema) if team.first else {}
+                table.append({"step": done, **metrics})
+            if team.first and (done % config.save_every == 0 or last):
+                _save(state_file, models, ema, optimizers, done, time.perf_counter() - clock, table, metrics, identity)
+                write_table(table_file, table)
+            bar.update(1)
     if table and team.first:
         from minicmdm.viz.plots import save_loss_curves
 
