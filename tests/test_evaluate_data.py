@@ -29,6 +29,7 @@ def run(request, tmp_path_factory):
             (root / "data" / f"{split}.json").write_text(json.dumps(entries), encoding="utf-8")
         (root / "data" / "programs.jsonl").unlink(missing_ok=True)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("minicmdm.viz.plots.save_loss_curves", lambda table, picture: picture.touch())  # slow to draw
         patch.setattr(stages, "FAST", {f"{name}_steps": 10 for name in stages.RUN} | {"dit_batch": 4, "vae_batch": 4})
         order = ["train", "--preset", "micro", "--fast", "--data", str(root / "data"), "--out", str(root / "run")]
         assert main(order) == 0
