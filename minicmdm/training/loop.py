@@ -166,9 +166,7 @@ def fit(
             models.zero_grad(set_to_none=True)
             total = torch.zeros((), device=team.device)
             for key, batch, generator in islice(drawn, len(share)):
-                with torch.random.fork_rng(
-                    devices=[]
-                ):  # layers' own dropout draws from the global generator: key it too
+                with torch.random.fork_rng(devices=[]):  # dropout draws from the global generator: key it too
                     torch.manual_seed(key)
                     value, numbers = loss(models, batch, generator)
                 (value / config.accumulate).backward()
