@@ -29,7 +29,7 @@ def data_make(arguments: argparse.Namespace) -> None:
 
 def data_info(arguments: argparse.Namespace) -> None:
     """`minicmdm data info`: a data set's card on stdout, and what is wrong with it, file by file, on stderr."""
-    from minicmdm.data.imports import inspect_folder
+    from minicmdm.data.inspection import inspect_folder
 
     card, wrong = inspect_folder(arguments.folder)
     if arguments.json:

@@ -18,12 +18,12 @@ ENDINGS = (".npy", ".gif", ".html", ".bvh")
 
 @dataclass
 class Motion:
-    """Joints (T,22,3) float32 in metres (Y up, facing +Z), features (T,D), caption, frames per second."""
+    """Joints (T,22,3), of KIT-ML (T,21,3), float32 in metres (Y up, facing +Z), features (T,D), caption, frame rate."""
 
     joints: np.ndarray
     features: np.ndarray | None = None
     caption: str = ""
-    fps: int = 20
+    fps: float = 20
 
     def __len__(self) -> int:
         return len(self.joints)
@@ -51,7 +51,7 @@ class Motion:
             elif ending == ".gif":
                 from minicmdm.viz.plots import save_gif
 
-                save_gif(self.joints, temporary, caption=self.caption)
+                save_gif(self.joints, temporary, caption=self.caption, fps=self.fps)
             else:
                 temporary.write_text(self.to_html(), encoding="utf-8")
         return path
@@ -91,7 +91,7 @@ def _in_notebook() -> bool:
 
 
 def load_joints(path: str | Path) -> np.ndarray:
-    """Read joints (T,22,3) in metres from an .npy file, as float64.
+    """Read joints (T,22,3), or KIT-ML's (T,21,3), in metres from an .npy file, as float64.
 
     Raises FileNotFoundError, or ValueError for a cut file, pickled objects, another shape, numbers that are not finite.
     """
@@ -109,9 +109,9 @@ def load_joints(path: str | Path) -> np.ndarray:
         raise ValueError(f"{path} is not a whole .npy file of numbers ({' '.join(str(error).split())})") from error
     if not isinstance(array, np.ndarray):
         raise ValueError(f"{path} is an archive (.npz): an .npy file of joints (T,22,3) was expected")
-    if array.ndim == 2 and array.shape[1] == 263:
+    if array.ndim == 2 and array.shape[1] in (263, 251):
         raise ValueError(f"{path} holds features {array.shape}: features_to_joints makes the joints (T,22,3) asked for")
-    if array.ndim != 3 or array.shape[1:] != (22, 3) or len(array) == 0:
+    if array.ndim != 3 or array.shape[1:] not in ((22, 3), (21, 3)) or len(array) == 0:
         raise ValueError(f"{path} must hold joints (T,22,3) in metres, and its shape is {array.shape}")
     if array.dtype.kind not in "fiu":
         raise ValueError(f"{path} must hold real numbers, and its type is {array.dtype}")

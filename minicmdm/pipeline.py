@@ -21,6 +21,7 @@ from torch import Tensor
 
 import minicmdm
 from minicmdm.data.features import features_to_joints
+from minicmdm.data.skeleton import skeleton_of
 from minicmdm.diffusion.sampling import SOLVERS, Denoise, from_noise_prediction, guided, sample
 from minicmdm.diffusion.schedules import schedule_matrix
 from minicmdm.diffusion.streaming import LatentStream
@@ -129,7 +130,8 @@ class MotionPipeline:
                 latents = sample(denoise, matrix, noise, solver=solver, path=self.preset.dit.path, generator=luck)
             for i, count, one in zip(chosen, counts, latents):  # a VAE that looks ahead must not see padding
                 features = self.decode(one[None, :count])[0, : frames[i]].numpy()  # (T,D)
-                motions[i] = Motion(features_to_joints(features).astype(np.float32), features, prompts[i])
+                joints = features_to_joints(features).astype(np.float32)  # (T,22,3)
+                motions[i] = Motion(joints, features, prompts[i], skeleton_of(joints.shape[1]).fps)
         return motions[0] if single else [motions[i] for i in range(len(prompts))]
 
     def stream(

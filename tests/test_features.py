@@ -238,7 +238,7 @@ def test_mirrored_captions(caption, mirrored):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda j: ft.joints_to_features(j[:, :21]), r"\(frames, 22, 3\).*\(61, 21, 3\)"),
+        (lambda j: ft.joints_to_features(j[:, :20]), r"\(frames, 22, 3\).*\(61, 20, 3\)"),
         (lambda j: ft.joints_to_features(j[:1]), "at least 2 frames.*got 1"),
         (lambda j: ft.joints_to_features(j, heading="north"), "corrected, humanml3d.*'north'"),
         (lambda j: ft.joints_to_features(np.where(np.arange(61)[:, None, None] == 8, np.nan, j)), "frame 8"),

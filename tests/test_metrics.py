@@ -569,7 +569,7 @@ BAD = {
     "alone": (lambda: m.diversity(E[:1], rng()), "N >= 2"),
     "one sample": (lambda: m.multimodality(W[:, :1, 0], rng()), "samples >= 2"),
     "no pair": (lambda: m.diversity(E, rng(), pairs=0), "at least 1"),
-    "21 joints": (lambda: m.mpjpe(J[:, 1:], J[:, 1:]), r"\(T, 22, 3\).*\(8, 21, 3\)"),
+    "20 joints": (lambda: m.mpjpe(J[:, 2:], J[:, 2:]), r"\(T, 22, 3\).*\(8, 20, 3\)"),
     "two frames": (lambda: m.accel(J[:2], J[:2]), "T >= 3"),
     "lengths": (lambda: m.pa_mpjpe(J, J[1:]), "one shape"),
     "three frames": (lambda: m.peak_jerk(W[:, :3]), "L >= 4"),

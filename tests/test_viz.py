@@ -74,7 +74,7 @@ def test_script_takes_an_element_and_data_and_nothing_else():
     [
         ([], [], "one caption per motion"),
         ([motion()], ["a", "b"], "1 motions, 2 captions"),
-        ([motion()[:, :21]], ["a"], r"motion 0.*\(12, 21, 3\)"),
+        ([motion()[:, :20]], ["a"], r"motion 0.*\(12, 20, 3\)"),
         ([motion(), motion()[:0]], ["a", "b"], r"motion 1.*\(0, 22, 3\)"),
         ([motion() * np.nan], ["a"], "NaN"),
     ],
@@ -182,7 +182,7 @@ def test_gif_plays_in_real_time_with_the_palette_we_chose(tmp_path):
         assert gif.width == 320 and gif.height > 320
 
 
-@pytest.mark.parametrize("joints", [np.zeros((4, 21, 3)), np.zeros((0, 22, 3)), np.full((4, 22, 3), np.nan)])
+@pytest.mark.parametrize("joints", [np.zeros((4, 20, 3)), np.zeros((0, 22, 3)), np.full((4, 22, 3), np.nan)])
 def test_pictures_refuse_what_is_no_motion(joints, tmp_path):
     for draw in (lambda: plots.pose_strip(joints), lambda: plots.save_gif(joints, tmp_path / "no.gif")):
         with pytest.raises(ValueError, match="joints"):

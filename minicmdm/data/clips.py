@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
 
 from minicmdm.data.programs import Program
-
-_GROUPS = [(0, 1), (1, 3), (3, 4), (4, 67), (67, 193), (193, 259), (259, 263)]  # features that share one Std
+from minicmdm.data.skeleton import skeleton_of
 
 
 @dataclass(frozen=True)
 class Clip:
-    """One motion and its words: features (T, 263), captions, and for each segment (start, end, sentence) in frames."""
+    """One motion and its words: features (T, 263 or 251), captions, and each segment as (start, end, sentence)."""
 
     name: str
     features: np.ndarray
@@ -26,7 +26,7 @@ class Clip:
 
 @dataclass(frozen=True)
 class MotionDataset:
-    """Clips of one split with the normalisation of their folder: mean and std (263,)."""
+    """Clips of one split with the normalisation of their folder: mean and std (263,) or (251,)."""
 
     clips: list[Clip]
     mean: np.ndarray
@@ -38,9 +38,17 @@ class MotionDataset:
 
 
 def feature_statistics(features: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and std (263,) over all frames; the std averaged within each group of features, as HumanML3D's is."""
+    """Mean and std (263,) or (251,) over all frames; the std averaged in each group of features, as HumanML3D's is."""
     stacked = np.concatenate(features).astype(np.float64)
     mean, std = stacked.mean(0), stacked.std(0)
-    for a, b in _GROUPS:
-        std[a:b] = max(std[a:b].mean(), 1e-4)
+    for group in (slice(0, 1), slice(1, 3), slice(3, 4), *skeleton_of(len(std)).blocks):
+        std[group] = max(std[group].mean(), 1e-4)
     return mean.astype(np.float32), std.astype(np.float32)
+
+
+def fingerprint_of(clips: list[Clip]) -> str:
+    """A hash of all features and words, for a folder that brings none."""
+    digest = hashlib.sha256()
+    for clip in clips:
+        digest.update(clip.features.tobytes() + "\n".join([clip.name, *clip.captions]).encode())
+    return digest.hexdigest()[:16]

@@ -11,7 +11,9 @@ the same numbers wherever the walker stands and whichever way the walker faces (
     193:259  every joint's step to the next frame, in this heading (m)
     259:263  is the left ankle, left foot, right ankle, right foot slow enough to be planted?
 
-T+1 frames of joints make T frames of features, because a step needs a next frame.
+T+1 frames of joints make T frames of features, because a step needs a next frame. KIT-ML has the same columns for 21
+joints, 251 in all, in its own units and at 12.5 fps; joints are in metres here and there, and an array's shape says
+whose it is (`skeleton.skeleton_of`).
 
 Two recipes share these columns. "humanml3d" repeats the released data to the letter, flaws included. The
 default, "corrected", is the same idea without them: hips the right way round, an angle smoothed instead of
@@ -27,39 +29,33 @@ import numpy as np
 
 from minicmdm.data.skeleton import (
     BONE_LENGTHS,
-    CHAINS,
     JOINT_NAMES,
     LEVELS,
-    MIRROR,
     NUM_JOINTS,
     PARENTS,
-    RAW_DIRECTIONS,
+    SKELETONS,
+    SMPL22,
+    Skeleton,
     normalize,
     quat_between,
     quat_inverse,
     quat_multiply,
     quat_yaw,
+    skeleton_of,
 )
 
-NUM_FEATURES, NUM_ESSENTIAL, NUM_COORDINATES = 263, 67, 66
+NUM_FEATURES, NUM_ESSENTIAL, NUM_COORDINATES = 263, 67, 66  # of HumanML3D
 ROOT_ANGULAR, ROOT_LINEAR, ROOT_HEIGHT = slice(0, 1), slice(1, 3), slice(3, 4)
-POSITIONS, ROTATIONS, VELOCITIES, CONTACTS = slice(4, 67), slice(67, 193), slice(193, 259), slice(259, 263)
+POSITIONS, ROTATIONS, VELOCITIES, CONTACTS = SMPL22.blocks
 HEADINGS = ("corrected", "humanml3d")
-
-CONTACT_JOINTS = (7, 10, 8, 11)  # left ankle, left foot, right ankle, right foot
-CONTACT_THRESHOLD = 0.002  # squared metres per frame: slower than 0.89 m/s counts as planted
+CONTACT_JOINTS, CONTACT_THRESHOLD = SMPL22.contact_joints, SMPL22.contact_threshold
 SIGMA, RADIUS = 20, 80  # the Gaussian that smooths the heading, in frames (1 s wide, cut at 4 sigma)
 
 _PARENT_INDEX = np.array(PARENTS)
-# The joint before each joint 1..21 on its chain. 0 stands for the chain's start: arms too begin at the root's
-# rotation and not at spine3's, a peculiarity of the format that we keep.
-_PREVIOUS = np.zeros(NUM_JOINTS, dtype=int)
-for _chain in CHAINS:
-    _PREVIOUS[list(_chain[2:])] = _chain[1:-1]
 
 
 def joints_to_features(joints: np.ndarray, heading: str = "corrected") -> np.ndarray:
-    """Features (T, 263) of joint positions (T+1, 22, 3) in metres at 20 fps, Y up.
+    """Features (T, 263) of joint positions (T+1, 22, 3) in metres at 20 fps, Y up; KIT-ML's (T, 251) of (T+1, 21, 3).
 
     With heading="corrected" turning or moving the whole motion over the floor changes nothing. float32 in
     gives float32 out, all else float64. ValueError for another shape, fewer than 2 frames, NaN or infinity.
@@ -67,7 +63,9 @@ def joints_to_features(joints: np.ndarray, heading: str = "corrected") -> np.nda
     if heading not in HEADINGS:
         raise ValueError(f"heading must be one of {', '.join(HEADINGS)}, got {heading!r}")
     joints, dtype = _checked_joints(joints, min_frames=2)
-    num_frames = len(joints) - 1  # T
+    num_frames, body = len(joints) - 1, skeleton_of(joints.shape[1])  # T
+    joints = joints / body.unit
+    places, rotations, velocities, contacts = body.blocks
 
     if heading == "corrected":
         yaw = smooth_yaw(facing_yaw(joints))  # (T+1,)
@@ -87,28 +85,31 @@ def joints_to_features(joints: np.ndarray, heading: str = "corrected") -> np.nda
     positions = seen[:-1, 1:].copy()  # (T, 21, 3)
     positions[..., [0, 2]] -= seen[:-1, :1, [0, 2]]
 
-    features = np.empty((num_frames, NUM_FEATURES), dtype=dtype)
+    features = np.empty((num_frames, body.num_features), dtype=dtype)
     features[:, 0] = half_steps
     features[:, ROOT_LINEAR] = turn(steps[:, 0], -yaw[1:])[:, [0, 2]]
     features[:, 3] = joints[:-1, 0, 1]
-    features[:, POSITIONS] = positions.reshape(num_frames, 63)
-    features[:, ROTATIONS] = _chain_rotations(posed, start).reshape(num_frames, 126)
-    features[:, VELOCITIES] = turn(steps, -yaw[:-1]).reshape(num_frames, 66)
-    features[:, CONTACTS] = (steps[:, CONTACT_JOINTS] ** 2).sum(-1) < CONTACT_THRESHOLD
+    features[:, places] = positions.reshape(num_frames, -1)
+    features[:, rotations] = _chain_rotations(posed, start, body).reshape(num_frames, -1)
+    features[:, velocities] = turn(steps, -yaw[:-1]).reshape(num_frames, -1)
+    features[:, contacts] = (steps[:, body.contact_joints] ** 2).sum(-1) < body.contact_threshold
     return features
 
 
 def features_to_joints(features: np.ndarray) -> np.ndarray:
-    """Joint positions (..., T, 22, 3) of features (..., T, 263): frame 0 at the floor's origin, facing +Z.
+    """Joint positions (..., T, 22, 3), in metres, of features (..., T, 263): frame 0 at the floor's origin, facing +Z.
 
-    It reads only the first 67 numbers, so essential features (..., T, 67) do as well. ValueError for another
-    width or for numbers that are not finite.
+    KIT-ML's (..., T, 251) are (..., T, 21, 3). It reads only the first 67 numbers (64), so essential features do as
+    well. ValueError for another width or for numbers that are not finite.
     """
     features = np.asarray(features)
-    if features.ndim < 2 or features.shape[-1] not in (NUM_ESSENTIAL, NUM_FEATURES) or features.shape[-2] < 1:
-        raise ValueError(f"features must be (..., T, 263) or (..., T, 67) with T >= 1, got {features.shape}")
+    widths = [width for body in SKELETONS for width in (body.num_features, body.num_essential)]
+    if features.ndim < 2 or features.shape[-1] not in widths or features.shape[-2] < 1:
+        told = "(..., T, 263) or (..., T, 67), of KIT-ML 251 or 64, with T >= 1"
+        raise ValueError(f"features must be {told}, got {features.shape}")
+    body = skeleton_of(features.shape[-1])
     dtype = np.float32 if features.dtype == np.float32 else np.float64
-    essential = features[..., :NUM_ESSENTIAL].astype(np.float64)
+    essential = features[..., : body.num_essential].astype(np.float64)
     if not np.isfinite(essential).all():
         raise ValueError("features hold NaN or infinite numbers; a motion must be finite in every frame")
 
@@ -118,21 +119,22 @@ def features_to_joints(features: np.ndarray) -> np.ndarray:
     steps[..., 1:, [0, 2]] = essential[..., :-1, ROOT_LINEAR]
     root = np.cumsum(turn(steps, yaw), axis=-2)  # (..., T, 3), still on the floor
 
-    joints = np.zeros((*yaw.shape, NUM_JOINTS, 3))
+    joints = np.zeros((*yaw.shape, body.num_joints, 3))
     joints[..., 0, 1] = essential[..., 3]
-    joints[..., 1:, :] = essential[..., POSITIONS].reshape(*yaw.shape, NUM_JOINTS - 1, 3)
-    return (turn(joints, yaw) + root[..., None, :]).astype(dtype)
+    joints[..., 1:, :] = essential[..., 4:].reshape(*yaw.shape, body.num_joints - 1, 3)
+    return ((turn(joints, yaw) + root[..., None, :]) * body.unit).astype(dtype)
 
 
 def essential(features: np.ndarray) -> np.ndarray:
-    """The essential features (..., T, 67): root and positions, all that recovery needs (MARDM); a view."""
-    return np.asarray(features)[..., :NUM_ESSENTIAL]
+    """The essential features (..., T, 67 or 64): root and positions, all that recovery needs (MARDM); a view."""
+    features = np.asarray(features)
+    return features[..., : skeleton_of(features.shape[-1]).num_essential]
 
 
 def coordinates(features: np.ndarray) -> np.ndarray:
-    """The absolute joint coordinates (..., T, 66) that the features stand for, frame 0 facing +Z (CDAMD)."""
+    """The absolute joint coordinates (..., T, 66 or 63) that the features stand for, frame 0 facing +Z (CDAMD)."""
     joints = features_to_joints(features)
-    return joints.reshape(*joints.shape[:-2], NUM_COORDINATES)
+    return joints.reshape(*joints.shape[:-2], 3 * joints.shape[-2])
 
 
 def turn(points: np.ndarray, yaw: np.ndarray) -> np.ndarray:
@@ -145,7 +147,8 @@ def turn(points: np.ndarray, yaw: np.ndarray) -> np.ndarray:
 
 def facing_yaw(joints: np.ndarray) -> np.ndarray:
     """Where hips and shoulders face, per frame and unwrapped (T,), in radians: 0 is +Z, positive is left."""
-    across = (joints[:, 2] - joints[:, 1]) + (joints[:, 17] - joints[:, 16])  # left to right
+    left_hip, right_hip, left_shoulder, right_shoulder = skeleton_of(joints.shape[1]).across
+    across = (joints[:, right_hip] - joints[:, left_hip]) + (joints[:, right_shoulder] - joints[:, left_shoulder])
     return np.unwrap(np.arctan2(across[:, 2], -across[:, 0]))  # forward is Y x across = (z, 0, -x)
 
 
@@ -168,8 +171,10 @@ def smooth_yaw(yaw: np.ndarray) -> np.ndarray:
 
 
 def released_yaw(joints: np.ndarray) -> np.ndarray:
-    """The heading (T,) of the released HumanML3D data: hips swapped, vectors smoothed, first row 0."""
-    across = normalize((joints[:, 1] - joints[:, 2]) + (joints[:, 17] - joints[:, 16]))
+    """The heading (T,) of the released data: hips swapped, vectors smoothed, first row 0."""
+    left_hip, right_hip, left_shoulder, right_shoulder = skeleton_of(joints.shape[1]).across
+    swapped = (joints[:, left_hip] - joints[:, right_hip]) + (joints[:, right_shoulder] - joints[:, left_shoulder])
+    across = normalize(swapped)
     padded = np.pad(across[:, [2, 0]], ((RADIUS, RADIUS), (0, 0)), mode="edge")
     z, x = (np.convolve(column, _GAUSSIAN, mode="valid") for column in padded.T)
     yaw = np.arctan2(z, -x)
@@ -181,13 +186,18 @@ _GAUSSIAN = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / SIGMA) ** 2)
 _GAUSSIAN /= _GAUSSIAN.sum()
 
 
-def _chain_rotations(joints: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """6D rotations (T, 21, 6) of every bone relative to the one before; chains start at rotation `start`."""
-    bones = joints[:, 1:] - joints[:, _PARENT_INDEX[1:]]  # (T, 21, 3)
-    world = np.empty((len(joints), NUM_JOINTS, 4))
+def _chain_rotations(joints: np.ndarray, start: np.ndarray, body: Skeleton) -> np.ndarray:
+    """6D rotations (T, J-1, 6) of every bone relative to the one before; chains start at rotation `start`."""
+    # The joint before each on its chain. 0 stands for the chain's start: arms too begin at the root's rotation and not
+    # at that of the joint they hang from, a peculiarity of the format that we keep.
+    previous = np.zeros(body.num_joints, dtype=int)
+    for chain in body.chains:
+        previous[list(chain[2:])] = chain[1:-1]
+    bones = joints[:, 1:] - joints[:, list(body.parents[1:])]  # (T, J-1, 3)
+    world = np.empty((len(joints), body.num_joints, 4))
     world[:, :1] = start
-    world[:, 1:] = quat_between(RAW_DIRECTIONS[1:], bones)
-    local = quat_multiply(quat_inverse(world[:, _PREVIOUS[1:]]), world[:, 1:])  # (T, 21, 4)
+    world[:, 1:] = quat_between(body.raw_directions[1:], bones)
+    local = quat_multiply(quat_inverse(world[:, previous[1:]]), world[:, 1:])  # (T, J-1, 4)
     w, x, y, z = np.moveaxis(local, -1, 0)
     first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]  # columns of the matrix
     second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
@@ -197,7 +207,7 @@ def _chain_rotations(joints: np.ndarray, start: np.ndarray) -> np.ndarray:
 def canonicalize(joints: np.ndarray, retarget: bool = False, floor: bool = False) -> np.ndarray:
     """Move and turn joints (T, 22, 3) so that frame 0 stands at x = z = 0 and faces +Z; heights stay.
 
-    retarget=True first gives the body HumanML3D's bone lengths; floor=True moves the whole clip up or down
+    retarget=True first gives a body of 22 joints HumanML3D's bone lengths; floor=True moves the whole clip up or down
     until its lowest joint is at y = 0.
     """
     joints, dtype = _checked_joints(joints)
@@ -211,7 +221,7 @@ def canonicalize(joints: np.ndarray, retarget: bool = False, floor: bool = False
 
 def retarget(joints: np.ndarray, lengths: np.ndarray = BONE_LENGTHS) -> np.ndarray:
     """Give joints (T, 22, 3) the bone lengths (22,) in metres; directions stay, the path scales by leg."""
-    joints, dtype = _checked_joints(joints)
+    joints, dtype = _checked_joints(joints, bodies=(SMPL22,))
     lengths = np.asarray(lengths, dtype=np.float64)
     if lengths.shape != (NUM_JOINTS,) or not (np.isfinite(lengths).all() and (lengths[1:] > 0).all()):
         raise ValueError(f"lengths must be {NUM_JOINTS} numbers, positive but for the pelvis, got {lengths}")
@@ -232,11 +242,11 @@ _retarget = retarget  # canonicalize has a parameter of the same name
 
 
 def mirror_joints(joints: np.ndarray) -> np.ndarray:
-    """The motion (..., 22, 3) in a mirror: x changes sign, left and right joints change places."""
+    """The motion (..., 22 or 21, 3) in a mirror: x changes sign, left and right joints change places."""
     joints = np.asarray(joints)
-    if joints.shape[-2:] != (NUM_JOINTS, 3):
-        raise ValueError(f"joints must have shape (..., 22, 3), got {joints.shape}")
-    return joints[..., MIRROR, :] * np.array([-1, 1, 1], dtype=joints.dtype)
+    if joints.shape[-2:] not in [(body.num_joints, 3) for body in SKELETONS]:
+        raise ValueError(f"joints must have shape (..., 22, 3) or (..., 21, 3), got {joints.shape}")
+    return joints[..., skeleton_of(joints.shape[-2]).mirror, :] * np.array([-1, 1, 1], dtype=joints.dtype)
 
 
 _MIRRORED_WORDS = {"left": "right", "right": "left", "clockwise": "counterclockwise"}
@@ -254,16 +264,20 @@ def mirror_caption(caption: str) -> str:
     return _SIDED.sub(swap, caption)
 
 
-def _checked_joints(joints: np.ndarray, min_frames: int = 1) -> tuple[np.ndarray, type]:
+def _checked_joints(
+    joints: np.ndarray, min_frames: int = 1, bodies: tuple[Skeleton, ...] = SKELETONS
+) -> tuple[np.ndarray, type]:
     """Joints as float64 with the dtype to answer in, or a ValueError that says what is wrong with them."""
     joints = np.asarray(joints)
     dtype = np.float32 if joints.dtype == np.float32 else np.float64
-    if joints.ndim != 3 or joints.shape[1:] != (NUM_JOINTS, 3):
-        raise ValueError(f"joints must have shape (frames, {NUM_JOINTS}, 3) in metres, got {joints.shape}")
+    if joints.ndim != 3 or joints.shape[1:] not in [(body.num_joints, 3) for body in bodies]:
+        told = " or ".join(f"(frames, {body.num_joints}, 3)" for body in bodies)
+        raise ValueError(f"joints must have shape {told} in metres, got {joints.shape}")
     if len(joints) < min_frames:
         raise ValueError(f"joints need at least {min_frames} frames (a step needs a next frame), got {len(joints)}")
     joints = joints.astype(np.float64)
     if not np.isfinite(joints).all():
         frame, joint, _ = np.argwhere(~np.isfinite(joints))[0]
-        raise ValueError(f"joints must be finite, but {JOINT_NAMES[joint]} is {joints[frame, joint]} in frame {frame}")
+        name = skeleton_of(joints.shape[1]).joint_names[joint]
+        raise ValueError(f"joints must be finite, but {name} is {joints[frame, joint]} in frame {frame}")
     return joints, dtype

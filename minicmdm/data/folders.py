@@ -1,20 +1,20 @@
 """Data sets on disk, in HumanML3D's layout: read, checked file by file, and written.
 
-    folder/new_joint_vecs/NAME.npy     (T, 263) features
+    folder/new_joint_vecs/NAME.npy     (T, 263) features; KIT-ML's are (T, 251)
     folder/texts/NAME.txt              one "caption#tokens#start#end" a line, in seconds; 0 and 0 mean the whole clip
     folder/train.txt val.txt test.txt  names of each split
-    folder/Mean.npy Std.npy            (263,)
+    folder/Mean.npy Std.npy            (263,) or (251,)
     folder/programs.jsonl              toy data only: the program behind each clip and a sentence for each segment
     folder/train.json val.json ...     BABEL only: labels of stretches of each clip, several sentences a motion
 
-The same reader loads the sample in data_toy/, a generated set, imported BVH files and a real HumanML3D folder.
+The same reader loads the sample in data_toy/, a generated set, imported BVH files, and a real HumanML3D or KIT-ML
+folder: the width of its features says which, and so at how many frames a second its captions count.
 A caption with a start and an end belongs to that stretch alone, so it becomes a clip of its own, as in HumanML3D's own
 loader. Nothing is ever unpickled, and no name leads out of the folder.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -25,12 +25,12 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from minicmdm.data.clips import Clip, MotionDataset, feature_statistics
+from minicmdm.data.clips import Clip, MotionDataset, feature_statistics, fingerprint_of
 from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES, Program, Segment
-from minicmdm.data.skeleton import FPS
+from minicmdm.data.skeleton import FPS, KIT21, SKELETONS, skeleton_of
 from minicmdm.files import NO_NPY
 
-WIDTH = 263
+WIDTHS = tuple(body.num_features for body in SKELETONS)  # 263, 251
 SPLIT_NAMES = ("train", "val", "test")
 ADVICE = "`minicmdm data info` lists all that is wrong with a folder"
 
@@ -38,15 +38,22 @@ ADVICE = "`minicmdm data info` lists all that is wrong with a folder"
 def load_dataset(folder: str | Path, split: str = "train") -> MotionDataset:
     """Read one split of a folder in HumanML3D's layout.
 
-    Clips under 40 frames are left out (HumanML3D's own rule) and those over 196 are cut. FileNotFoundError for a
-    missing folder, split or file and ValueError for anything that cannot be read as it should, with the file's name.
+    Clips under 40 frames are left out (in KIT-ML under 24: their own rules) and those over 196 are cut.
+    FileNotFoundError for a missing folder, split or file and ValueError for anything that cannot be read as it should,
+    or is of another width than the rest, with the file's name.
     """
     folder = Path(folder)
     records = clip_records(folder, split)
-    clips = [clip for name in split_names(folder, split) for clip in read_clips(folder, name, records.get(name, {}))]
+    clips: list[Clip] = []
+    for name in split_names(folder, split):
+        clips += read_clips(folder, name, records.get(name, {}))
+        if clips and (strange := other_width(clips[0].features, clips[-1].features)):
+            raise ValueError(f"{folder / 'new_joint_vecs' / name}.npy {strange}")
     if not clips:
-        raise ValueError(f"{folder / split}.txt leaves no clip of at least {MIN_FRAMES} frames; {ADVICE}")
-    mean, std = read_statistics(folder) or feature_statistics([clip.features for clip in clips])
+        least = f"{MIN_FRAMES} frames (of KIT-ML {KIT21.min_frames})"
+        raise ValueError(f"{folder / split}.txt leaves no clip of at least {least}; {ADVICE}")
+    width = clips[0].features.shape[1]
+    mean, std = read_statistics(folder, width) or feature_statistics([clip.features for clip in clips])
     note = folder / "fingerprint.txt"
     fingerprint = _text(note).strip() if note.is_file() else fingerprint_of(clips)
     return MotionDataset(clips, mean, std, fingerprint)
@@ -67,12 +74,22 @@ def split_names(folder: Path, split: str) -> list[str]:
 
 
 def read_clips(folder: Path, name: str, record: dict) -> list[Clip]:
-    """A motion as one clip for what is said of the whole, and one for each stretch that has captions of its own.
-
-    Those under 40 frames are left out. FileNotFoundError and ValueError as `load_dataset`.
-    """
+    """A motion as `cut_clips` makes clips of it. FileNotFoundError and ValueError as `load_dataset`."""
     features = read_features(folder / "new_joint_vecs" / f"{name}.npy", f"{name} is in a split, but its file")
-    whole, stretches = read_captions(folder / "texts" / f"{name}.txt", len(features))
+    fps = skeleton_of(features.shape[1]).fps
+    captions = read_captions(folder / "texts" / f"{name}.txt", len(features), fps)
+    return cut_clips(folder, name, features, captions, record)
+
+
+Captions = tuple[list[str], dict[tuple[int, int], list[str]]]  # of the whole clip, and of stretches of it
+
+
+def cut_clips(folder: Path, name: str, features: np.ndarray, captions: Captions, record: dict) -> list[Clip]:
+    """One clip for what is said of the whole motion, and one for each stretch that has captions of its own.
+
+    Those too short for their data set are left out. ValueError: labels that are no stretches of the motion.
+    """
+    whole, stretches = captions
     labels = [tuple(label) for label in record.get("labels", [])]
     for start, end, text in labels:
         if not 0 <= start < end <= len(features) or not text.strip():
@@ -86,16 +103,26 @@ def read_clips(folder: Path, name: str, record: dict) -> list[Clip]:
         clips.append(Clip(name, features[:MAX_FRAMES], said, labels, asked, realised, kind))
     for number, ((start, end), captions) in enumerate(stretches.items()):
         clips.append(Clip(f"{name}@{number}", features[start:end][:MAX_FRAMES], captions, []))
-    return [clip for clip in clips if len(clip.features) >= MIN_FRAMES]
+    return [clip for clip in clips if len(clip.features) >= skeleton_of(features.shape[1]).min_frames]
+
+
+def other_width(first: np.ndarray, features: np.ndarray) -> str:
+    """What is wrong with features (T,D) that are not as wide as the first ones of their folder; "" if they are."""
+    if first.shape[1] == features.shape[1]:
+        return ""
+    return (
+        f"holds {features.shape[1]} features a frame, and what was read before it {first.shape[1]}: one body a folder"
+    )
 
 
 def read_features(path: Path, what: str = "the file") -> np.ndarray:
-    """Features (T, 263) as float32. FileNotFoundError; ValueError: pickled, cut short, another width, not finite."""
+    """Features (T, 263 or 251) as float32. FileNotFoundError; ValueError: pickled, cut, another width, not finite."""
     if not path.is_file():
         raise FileNotFoundError(f"{what} {path} is not there")
     features = _array(path)
-    if features.ndim != 2 or features.shape[1] != WIDTH or not len(features):
-        raise ValueError(f"{path}: expected finite features of shape (T, {WIDTH}), got shape {features.shape}")
+    if features.ndim != 2 or features.shape[1] not in WIDTHS or not len(features):
+        told = " or ".join(f"(T, {width})" for width in WIDTHS)
+        raise ValueError(f"{path}: expected finite features of shape {told}, got shape {features.shape}")
     if features.dtype.kind in "fiu":
         with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused
             features = features.astype(np.float32)
@@ -105,7 +132,7 @@ def read_features(path: Path, what: str = "the file") -> np.ndarray:
     return features
 
 
-def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, int], list[str]]]:
+def read_captions(path: Path, frames: int, fps: float = FPS) -> Captions:
     """What is said of the whole clip, and of stretches of it: (start, end) in frames -> captions.
 
     FileNotFoundError; ValueError: no UTF-8, no caption at all, or a stretch that is none.
@@ -125,14 +152,14 @@ def read_captions(path: Path, frames: int) -> tuple[list[str], dict[tuple[int, i
         if start == end == 0:
             whole.append(caption.strip())
         elif 0 <= start < end < math.inf:
-            stretch = int(FPS * start), min(int(FPS * end), frames)
+            stretch = int(fps * start), min(int(fps * end), frames)
             if stretch[0] < stretch[1]:
                 stretches.setdefault(stretch, []).append(caption.strip())
             late += stretch[0] >= stretch[1]
         else:
             raise ValueError(f"{path}, line {number}: from {start} to {end} seconds is no stretch of a motion")
     if late and not whole and not stretches:
-        raise ValueError(f"{path}: what it tells of begins after the clip's end, at {frames / FPS:.2f} seconds")
+        raise ValueError(f"{path}: what it tells of begins after the clip's end, at {frames / fps:.2f} seconds")
     if not whole and not stretches:
         raise ValueError(f"{path} holds no caption: lines like 'a person walks.#a/DET person/NOUN#0.0#0.0' go there")
     return whole, stretches
@@ -224,26 +251,18 @@ def clip_records(folder: Path, split: str) -> dict[str, dict]:
     return {}
 
 
-def read_statistics(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
-    """Mean.npy and Std.npy (263,), or None where one is missing. ValueError: another width, not finite, no spread."""
+def read_statistics(folder: Path, width: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Mean.npy and Std.npy (width,), or None where one is missing. ValueError: another width, not finite, no spread."""
     paths = [folder / "Mean.npy", folder / "Std.npy"]
     if not all(path.is_file() for path in paths):
         return None
     mean, std = (_array(path) for path in paths)
     for path, value in zip(paths, (mean, std)):
-        if value.shape != (WIDTH,) or value.dtype.kind != "f" or not np.isfinite(value).all():
-            raise ValueError(f"{path}: expected {WIDTH} finite numbers, got {value.dtype} of shape {value.shape}")
+        if value.shape != (width,) or value.dtype.kind != "f" or not np.isfinite(value).all():
+            raise ValueError(f"{path}: expected {width} finite numbers, got {value.dtype} of shape {value.shape}")
     if (std <= 0).any():
         raise ValueError(f"{paths[1]}: every std is above 0, and that of feature {int(std.argmin())} is {std.min()}")
     return mean.astype(np.float32), std.astype(np.float32)
-
-
-def fingerprint_of(clips: list[Clip]) -> str:
-    """A hash of all features and words, for a folder that brings none."""
-    digest = hashlib.sha256()
-    for clip in clips:
-        digest.update(clip.features.tobytes() + "\n".join([clip.name, *clip.captions]).encode())
-    return digest.hexdigest()[:16]
 
 
 def _array(path: Path) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""A folder of BVH files becomes a data set, and a data set's folder is told file by file what is wrong with it."""
+"""A folder of BVH files becomes a data set."""
 
 from __future__ import annotations
 
@@ -11,21 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from minicmdm.data.bvh import MAPS, Place, read_bvh, to_joints
-from minicmdm.data.clips import Clip, MotionDataset, feature_statistics
+from minicmdm.data.clips import Clip, MotionDataset, feature_statistics, fingerprint_of
 from minicmdm.data.features import joints_to_features
-from minicmdm.data.folders import (
-    SPLIT_NAMES,
-    check_new_folder,
-    clip_records,
-    fingerprint_of,
-    read_captions,
-    read_clips,
-    read_features,
-    read_statistics,
-    split_names,
-    write_folder,
-)
-from minicmdm.data.programs import MAX_FRAMES, MIN_FRAMES
+from minicmdm.data.folders import SPLIT_NAMES, check_new_folder, write_folder
+from minicmdm.data.programs import MIN_FRAMES
 from minicmdm.data.skeleton import FPS
 
 EVERY = 10  # one clip in ten goes to val and one to test; with fewer than ten clips all splits are the same
@@ -134,56 +123,3 @@ def read_csv(path: str | Path) -> dict[str, list[str]]:
         raise ValueError(f"{path} is not UTF-8 text (byte {error.start}): save it as UTF-8") from error
     except csv.Error as error:
         raise ValueError(f"{path} is no CSV ({error})") from error
-
-
-def inspect_folder(folder: str | Path) -> tuple[dict[str, object], list[str]]:
-    """A data set's card, and what is wrong with it, file by file. FileNotFoundError: no folder, or no split in it."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {folder}: expected a data set in HumanML3D's layout")
-    splits = [name for name in SPLIT_NAMES if (folder / f"{name}.txt").is_file()]
-    if not splits:
-        raise FileNotFoundError(f"{folder} holds none of {', '.join(f'{name}.txt' for name in SPLIT_NAMES)}")
-    card: dict[str, object] = {"folder": str(folder)}
-    wrong: list[str] = []
-    seen: dict[str, str] = {}
-    frames, captions, words = [], 0, set()
-
-    def attempt(work: Callable):
-        try:
-            return work()
-        except (ValueError, OSError) as error:
-            wrong.append(" ".join(str(error).split()))
-
-    for split in splits:
-        names = attempt(lambda: split_names(folder, split)) or []  # noqa: B023
-        card[split] = len(names)
-        records = attempt(lambda: clip_records(folder, split)) or {}  # noqa: B023
-        for name in names:
-            if name in seen:
-                wrong.append(f"{split}.txt names {name}, which {seen[name]}.txt has named already")
-                continue
-            seen[name] = split
-            path = folder / "new_joint_vecs" / f"{name}.npy"
-            features = attempt(lambda: read_features(path, f"{name} is in {split}.txt, but its file"))  # noqa: B023
-            if features is None:
-                continue
-            frames.append(len(features))
-            if len(features) < MIN_FRAMES:
-                wrong.append(f"{path} has {len(features)} frames: those under {MIN_FRAMES} are left out")
-            elif len(features) > MAX_FRAMES:
-                wrong.append(f"{path} has {len(features)} frames: what is over {MAX_FRAMES} is cut")
-            said = attempt(lambda: read_captions(folder / "texts" / f"{name}.txt", len(features)))  # noqa: B023
-            if said is not None:
-                attempt(lambda: read_clips(folder, name, records.get(name, {})))  # noqa: B023
-                sentences = [*said[0], *(text for some in said[1].values() for text in some)]
-                captions += len(sentences)
-                words |= {word for text in sentences for word in re.findall(r"[^\W\d_]+", text.lower())}
-    attempt(lambda: read_statistics(folder))
-    for name in ("Mean.npy", "Std.npy"):
-        if not (folder / name).is_file():
-            wrong.append(f"{folder / name} is not there: mean and std of the training clips are used")
-    if frames:
-        card |= {"seconds": round(sum(frames) / FPS, 1), "frames_least": min(frames), "frames_most": max(frames)}
-    card |= {"captions": captions, "words": len(words), "problems": len(wrong)}
-    return card, wrong

@@ -1,4 +1,4 @@
-"""The body: 22 joints, how they hang together, and the rotation algebra that moves them.
+"""The body: 22 joints (or KIT-ML's 21), how they hang together, and the rotation algebra that moves them.
 
 Everything is numpy, float64 inside, and vectorised over leading dimensions: a function that takes one
 quaternion (4,) also takes a clip of them (T, 22, 4). Space is metres, Y up; a person who faces +Z has the
@@ -7,9 +7,11 @@ left hand at +X. A quaternion is (w, x, y, z) and q rotates v as q v q^-1.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-FPS = 20  # frames per second of every motion in this library
+FPS = 20  # frames per second of every motion in this library but KIT-ML's
 
 JOINT_NAMES = (
     *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle"),
@@ -51,7 +53,114 @@ for _joint in range(1, NUM_JOINTS):
 LEVELS = tuple(np.flatnonzero(np.array(_DEPTH) == depth) for depth in range(1, max(_DEPTH) + 1))
 
 _PARENT_INDEX = np.array(PARENTS)
-for _constant in (BONE_LENGTHS, MIRROR, RAW_DIRECTIONS, REST_OFFSETS, _PARENT_INDEX):
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """A data set's body: its joints, and in what units and at what rate its features tell of them."""
+
+    joint_names: tuple[str, ...]
+    parents: tuple[int, ...]
+    chains: tuple[tuple[int, ...], ...]  # right leg, left leg, trunk, right arm, left arm
+    left_right: tuple[tuple[int, int], ...]
+    raw_directions: np.ndarray  # (J, 3) where each bone points at rest
+    across: tuple[int, int, int, int]  # left hip, right hip, left shoulder, right shoulder: they say where it faces
+    contact_joints: tuple[int, int, int, int]  # left ankle, left foot, right ankle, right foot
+    contact_threshold: float  # squared units per frame: what is slower counts as planted
+    head: int
+    fps: float
+    unit: float  # metres in a unit of length of the features
+    min_frames: int  # shorter clips are left out of the data set
+
+    @property
+    def num_joints(self) -> int:
+        """J: 22 or 21."""
+        return len(self.joint_names)
+
+    @property
+    def num_features(self) -> int:
+        """Numbers a frame: 263 or 251."""
+        return 12 * self.num_joints - 1
+
+    @property
+    def num_essential(self) -> int:
+        """Those of them that recovery needs: root and positions, 67 or 64."""
+        return 3 * self.num_joints + 1
+
+    @property
+    def blocks(self) -> tuple[slice, slice, slice, slice]:
+        """The columns of positions, rotations, velocities and contacts; the root's four come before."""
+        a, b, c = self.num_essential, 9 * self.num_joints - 5, 12 * self.num_joints - 5
+        return slice(4, a), slice(a, b), slice(b, c), slice(c, c + 4)
+
+    @property
+    def feet(self) -> tuple[int, int]:
+        """The left and the right foot's joint."""
+        return self.contact_joints[1], self.contact_joints[3]
+
+    @property
+    def sides(self) -> list[str]:
+        """ "left", "right" or "middle" for each joint."""
+        found = {joint: side for pair in self.left_right for joint, side in zip(pair, ("left", "right"))}
+        return [found.get(joint, "middle") for joint in range(self.num_joints)]
+
+    @property
+    def mirror(self) -> np.ndarray:
+        """Which joint each joint becomes in a mirror. (J,)"""
+        found = {a: b for pair in self.left_right for a, b in (pair, pair[::-1])}
+        return np.array([found.get(joint, joint) for joint in range(self.num_joints)])
+
+
+SMPL22 = Skeleton(
+    *(JOINT_NAMES, PARENTS, CHAINS, LEFT_RIGHT, RAW_DIRECTIONS, (1, 2, 16, 17), (7, 10, 8, 11)),
+    contact_threshold=0.002,  # 0.89 m/s
+    head=15,
+    fps=FPS,
+    unit=1.0,
+    min_frames=40,
+)
+
+# KIT-ML as Guo et al. (2022) released it. The Master Motor Map, where it comes from, calls joints 5-7 and 11-15 left;
+# the features face +Z with them at -X, which is the right, and so does all that reads them. Their rest directions
+# kept the sign of the left, which only the rotations (a convention) know of.
+_KIT_LIMBS = ("hip", "knee", "ankle", "heel", "foot")
+KIT21 = Skeleton(
+    joint_names=(
+        *("pelvis", "spine1", "spine2", "neck", "head", "right_shoulder", "right_elbow", "right_wrist"),
+        *("left_shoulder", "left_elbow", "left_wrist", *(f"right_{limb}" for limb in _KIT_LIMBS)),
+        *(f"left_{limb}" for limb in _KIT_LIMBS),
+    ),
+    parents=(-1, 0, 1, 2, 3, 3, 5, 6, 3, 8, 9, 0, 11, 12, 13, 14, 0, 16, 17, 18, 19),
+    chains=((0, 11, 12, 13, 14, 15), (0, 16, 17, 18, 19, 20), (0, 1, 2, 3, 4), (3, 5, 6, 7), (3, 8, 9, 10)),
+    left_right=((8, 5), (9, 6), (10, 7), (16, 11), (17, 12), (18, 13), (19, 14), (20, 15)),
+    raw_directions=np.array(
+        [0 * _X, *[_Y] * 4, _X, -_Y, -_Y, -_X, -_Y, -_Y, _X, -_Y, -_Y, _Z, _Z, -_X, -_Y, -_Y, _Z, _Z]  # (21, 3)
+    ),
+    across=(16, 11, 8, 5),
+    contact_joints=(19, 20, 14, 15),
+    contact_threshold=0.05,  # 4 mm/s: hardly ever
+    head=4,
+    fps=12.5,
+    unit=0.75 / 480,  # 1.56 mm: the root, at 560 units, is 0.87 m above the floor
+    min_frames=24,
+)
+SKELETONS = (SMPL22, KIT21)
+
+
+def skeleton_of(size: int) -> Skeleton:
+    """The body with so many joints (22, 21), features (263, 251) or essential features (67, 64). ValueError: no body's.
+
+    No two of these numbers are the same, so an array's own shape says whose it is.
+    """
+    for body in SKELETONS:
+        if size in (body.num_joints, body.num_features, body.num_essential):
+            return body
+    raise ValueError(
+        f"expected 263 features or 22 joints (HumanML3D), or 251 features or 21 joints (KIT-ML), and {size} came"
+    )
+
+
+for _constant in (BONE_LENGTHS, MIRROR, RAW_DIRECTIONS, REST_OFFSETS, _PARENT_INDEX, KIT21.raw_directions):
     _constant.setflags(write=False)  # shared by everyone, so nobody may edit them in place
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from torch.nn.utils.rnn import pack_padded_sequence, pad_sequence
 from minicmdm.config import Preset
 from minicmdm.data.dataset import Clip, MotionDataset
 from minicmdm.data.features import NUM_FEATURES
+from minicmdm.data.skeleton import SKELETONS, skeleton_of
 from minicmdm.evaluation.metrics import r_precision
 from minicmdm.evaluation.pairs import draw_pairs
 from minicmdm.files import write_text
@@ -47,7 +48,7 @@ class EvaluatorConfig:
     """One judge's shape."""
 
     kind: str = "t2m"  # "t2m" or "clip"
-    dims: int = NUM_FEATURES  # how many features it reads, from the first: 263 or 67
+    dims: int = NUM_FEATURES  # how many features it reads, from the first: 263 or 67, of KIT-ML 251 or 64
     width: int = 112
     embed_dim: int = 64  # few, since FID between two draws of the same motions grows with them
 
@@ -100,7 +101,8 @@ class Evaluator(nn.Module):
 
     def __init__(self, cfg: EvaluatorConfig, words: list[str]):
         super().__init__()
-        if cfg.kind not in ("t2m", "clip") or cfg.dims not in (NUM_FEATURES, ESSENTIAL) or cfg.width % (2 * HEADS):
+        dims = [size for body in SKELETONS for size in (body.num_features, body.num_essential)]
+        if cfg.kind not in ("t2m", "clip") or cfg.dims not in dims or cfg.width % (2 * HEADS):
             raise ValueError(f"expected 't2m' or 'clip', 263 or 67 dims, a width that {2 * HEADS} divides, got {cfg}")
         self.cfg, self.words = cfg, list(words)
         self.places = {word: place for place, word in enumerate(self.words, start=FIRST)}
@@ -121,9 +123,10 @@ class Evaluator(nn.Module):
 
         Neither what follows a motion's end is read nor a last group of less than four frames. ValueError: shapes.
         """
-        fits = x.ndim == 3 and x.shape[2] in (NUM_FEATURES, self.cfg.dims) and lengths.shape == x.shape[:1] != (0,)
+        whole = skeleton_of(self.cfg.dims).num_features
+        fits = x.ndim == 3 and x.shape[2] in (whole, self.cfg.dims) and lengths.shape == x.shape[:1] != (0,)
         if not fits or lengths.min() < GROUP or lengths.max() > x.shape[1]:
-            raise ValueError(f"expected x (B,T,263), B lengths in 4..T; got {tuple(x.shape)}, {lengths.tolist()}")
+            raise ValueError(f"expected x (B,T,{whole}), B lengths in 4..T; got {tuple(x.shape)}, {lengths.tolist()}")
         ends = lengths.to(x.device) // GROUP * GROUP  # (B,)
         x = x[..., : self.cfg.dims].sub(self.mean).div_(self.std).transpose(1, 2)  # (B,T,263) -> (B,dims,T)
         for conv in self.down:  # each meets zeros past the end, as if nothing followed
@@ -220,7 +223,9 @@ def train_bench(
     cfg, judges, metrics, seconds = plan.train, nn.ModuleDict(), {}, 0.0
     sizes = {"steps": cfg.evaluator_steps, "batch": cfg.evaluator_batch, "lr": cfg.evaluator_lr, "seed": cfg.seed}
     how = {"accumulate": cfg.accumulate, "resume": resume, "progress": progress, "team": team}
+    body = skeleton_of(len(train_set.mean))
     for name, shape in BENCH.items():
+        shape = replace(shape, dims=body.num_features if shape.dims == NUM_FEATURES else body.num_essential)
         result = train_evaluator(shape, train_set, val_set, out, **sizes, **how)
         judges[name], seconds = result.ema["evaluator"], seconds + result.seconds
         metrics |= {f"{name}_{key}": value for key, value in result.metrics.items()}

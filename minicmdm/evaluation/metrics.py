@@ -16,7 +16,7 @@ from numpy.random import Generator
 
 from minicmdm.data.features import facing_yaw, turn
 from minicmdm.data.programs import FIELDS, Program, score
-from minicmdm.data.skeleton import FPS, NUM_JOINTS
+from minicmdm.data.skeleton import KIT21, NUM_JOINTS, skeleton_of
 
 # Which way is better, as papers print it; "→" is nearer to the ground truth. (A frozen body has the least skating.)
 _UP = "oracle_accuracy oracle_accuracy_heldout r_at_1 r_at_2 r_at_3 multimodality clip_score m2t m2m"
@@ -24,7 +24,6 @@ _DOWN = "mm_dist fid skating_ratio mpjpe_mm pa_mpjpe_mm accel_mm auj transition_
 _NEAR = "diversity pj segments_found"
 ARROWS = dict.fromkeys(_UP.split(), "↑") | dict.fromkeys(_DOWN.split(), "↓") | dict.fromkeys(_NEAR.split(), "→")
 
-FEET = (10, 11)  # left, right
 CONTACT_HEIGHT, SKATING_SPEED, SKATING_WINDOW = 0.05, 0.5, 5  # m, m/s (a comment in the release says 0.2), steps
 
 
@@ -116,7 +115,7 @@ def multimodality(motion: np.ndarray, rng: Generator, pairs: int = 10) -> float:
 
 def mpjpe(a: np.ndarray, b: np.ndarray, root_align: bool = True) -> float:
     """Mean distance (m) of the joints of a and b (T,22,3); `root_align` first moves each pelvis to the origin."""
-    a, b = _alike("T", NUM_JOINTS, 3, a=a, b=b)
+    a, b = _alike("T", _count(a), 3, a=a, b=b)
     if root_align:
         a, b = a - a[:, :1], b - b[:, :1]
     return float(np.linalg.norm(a - b, axis=-1).mean())
@@ -127,7 +126,7 @@ def pa_mpjpe(a: np.ndarray, b: np.ndarray) -> float:
 
     Best is least squares, without reflections. It is not symmetric: the scale is b's.
     """
-    a, b = (x - x.mean(1, keepdims=True) for x in _alike("T", NUM_JOINTS, 3, a=a, b=b))
+    a, b = (x - x.mean(1, keepdims=True) for x in _alike("T", _count(a), 3, a=a, b=b))
     u, _, vt = np.linalg.svd(a.transpose(0, 2, 1) @ b)  # (T,3,3)
     u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]  # where a mirror fits best, the best rotation instead
     turned = a @ u @ vt  # (T,22,3)
@@ -138,7 +137,7 @@ def pa_mpjpe(a: np.ndarray, b: np.ndarray) -> float:
 
 def accel(a: np.ndarray, b: np.ndarray) -> float:
     """ACCEL: mean distance (m/frame^2) of second differences over time of a and b (T,22,3), T >= 3, nothing aligned."""
-    a, b = _alike("T >= 3", NUM_JOINTS, 3, a=a, b=b)
+    a, b = _alike("T >= 3", _count(a), 3, a=a, b=b)
     return float(np.linalg.norm(np.diff(a - b, n=2, axis=0), axis=-1).mean())
 
 
@@ -183,8 +182,10 @@ def skating_ratio(joints: np.ndarray) -> float:
     On the floor is below 5 cm before and after the step; sliding is faster than 0.5 m/s over the floor, in this step
     and on average over the five around it (steps beyond the ends count as still). Source: GMD (Karunratanakul 2023).
     """
-    feet = _array("joints", joints, "T >= 2", NUM_JOINTS, 3)[:, FEET]  # (T,2,3)
-    speed = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) * FPS  # (T-1,2)
+    joints = _array("joints", joints, "T >= 2", _count(joints), 3)
+    body = skeleton_of(joints.shape[1])
+    feet = joints[:, body.feet]  # (T,2,3)
+    speed = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) * body.fps  # (T-1,2)
     around = np.pad(speed, ((SKATING_WINDOW // 2,) * 2, (0, 0)))
     average = np.lib.stride_tricks.sliding_window_view(around, SKATING_WINDOW, axis=0).mean(-1)  # (T-1,2)
     low = feet[..., 1] < CONTACT_HEIGHT
@@ -224,6 +225,11 @@ def _array(name: str, value: object, *shape: str | int) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite, but it holds NaN or infinity, which would spoil every mean")
     return array
+
+
+def _count(joints: object) -> int:
+    """How many joints must be there: 22, but for a body that is whole with KIT-ML's 21."""
+    return KIT21.num_joints if np.shape(joints)[-2:] == (KIT21.num_joints, 3) else NUM_JOINTS
 
 
 def _alike(*shape: str | int, **arrays: object) -> list[np.ndarray]:

@@ -21,33 +21,41 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from minicmdm.config import TMRConfig
-from minicmdm.data.features import NUM_FEATURES, POSITIONS, ROTATIONS, VELOCITIES
-from minicmdm.data.skeleton import CHAINS
+from minicmdm.data.features import NUM_FEATURES
+from minicmdm.data.skeleton import SMPL22, Skeleton, skeleton_of
 from minicmdm.models.layers import sinusoid
 from minicmdm.models.text import TextEncoder
 
 MAX_SCALE = 100.0  # of the cosines: sharper would learn from the hardest pair of a batch only
 
 
-def _columns(joints: tuple[int, ...], contacts: tuple[int, ...] = ()) -> tuple[int, ...]:
-    # Positions and rotations begin at joint 1, velocities at joint 0.
-    found = list(contacts)
-    for joint in joints:
-        found += range(POSITIONS.start + 3 * (joint - 1), POSITIONS.start + 3 * joint)
-        found += range(ROTATIONS.start + 6 * (joint - 1), ROTATIONS.start + 6 * joint)
-        found += range(VELOCITIES.start + 3 * joint, VELOCITIES.start + 3 * (joint + 1))
-    return tuple(sorted(found))
+def parts_of(body: Skeleton) -> dict[str, tuple[int, ...]]:
+    """The six parts' columns of a body's features.
+
+    The joint that carries both arms (9, spine3) is in three parts; every other column is in exactly one.
+    """
+    positions, rotations, velocities, contacts = (block.start for block in body.blocks)
+
+    def columns(joints: tuple[int, ...], *planted: int) -> tuple[int, ...]:
+        found = [contacts + place for place in planted]
+        for joint in joints:  # positions and rotations begin at joint 1, velocities at joint 0
+            found += range(positions + 3 * (joint - 1), positions + 3 * joint)
+            found += range(rotations + 6 * (joint - 1), rotations + 6 * joint)
+            found += range(velocities + 3 * joint, velocities + 3 * (joint + 1))
+        return tuple(sorted(found))
+
+    right_leg, left_leg, trunk, right_arm, left_arm = body.chains
+    return {
+        "root": (0, 1, 2, 3, *range(velocities, velocities + 3)),
+        "right_leg": columns(right_leg[1:], 2, 3),
+        "left_leg": columns(left_leg[1:], 0, 1),
+        "backbone": columns(trunk[1:]),
+        "right_arm": columns(right_arm),
+        "left_arm": columns(left_arm),
+    }
 
 
-# Joint 9 (spine3) carries both arms, so it is in three parts; every other column is in exactly one.
-PARTS: dict[str, tuple[int, ...]] = {
-    "root": (0, 1, 2, 3, *range(VELOCITIES.start, VELOCITIES.start + 3)),
-    "right_leg": _columns(CHAINS[0][1:], contacts=(261, 262)),
-    "left_leg": _columns(CHAINS[1][1:], contacts=(259, 260)),
-    "backbone": _columns(CHAINS[2][1:]),
-    "right_arm": _columns(CHAINS[3]),
-    "left_arm": _columns(CHAINS[4]),
-}
+PARTS = parts_of(SMPL22)
 
 
 class PartLinear(nn.Module):
@@ -96,12 +104,13 @@ class PartBlock(nn.Module):
 class MotionTeacher(nn.Module):
     """Motion and sentences in one space: Part-TMR or TMR by frames, and the text encoder that it teaches.
 
+    `width` is that of the features: 263, or KIT-ML's 251.
     (Or the words of one that learns no more, read beforehand: a `WordCache`, no module and no part of its weights.)
 
-    ValueError: an unknown `parts` or `mean`, or a width that does not split into heads.
+    ValueError: an unknown `parts` or `mean`, or a dim that does not split into heads.
     """
 
-    def __init__(self, cfg: TMRConfig, text: TextEncoder):
+    def __init__(self, cfg: TMRConfig, text: TextEncoder, width: int = NUM_FEATURES):
         super().__init__()
         if cfg.parts not in ("six", "one") or cfg.mean not in ("valid", "padded"):
             raise ValueError(
@@ -109,23 +118,23 @@ class MotionTeacher(nn.Module):
             )
         if cfg.dim % cfg.heads or cfg.dim % 2:
             raise ValueError(f"dim must be even and a multiple of heads, got {cfg.dim} and {cfg.heads}")
-        self.cfg, self.text = cfg, text
-        self.columns = [list(c) for c in PARTS.values()] if cfg.parts == "six" else [list(range(NUM_FEATURES))]
-        parts = len(self.columns)
+        self.cfg, self.text, self.width = cfg, text, width
+        parts = parts_of(skeleton_of(width)).values() if cfg.parts == "six" else [range(width)]
+        self.columns = [list(columns) for columns in parts]
         self.embed = nn.ModuleList(nn.Linear(len(columns), cfg.dim) for columns in self.columns)
-        self.blocks = nn.ModuleList(PartBlock(parts, cfg.dim, cfg.heads, cfg.dropout) for _ in range(cfg.layers))
+        self.blocks = nn.ModuleList(PartBlock(len(parts), cfg.dim, cfg.heads, cfg.dropout) for _ in range(cfg.layers))
         self.narrow, self.refine = nn.Linear(cfg.dim, cfg.embed_dim), nn.Linear(cfg.embed_dim, cfg.embed_dim)
         self.dropout, self.norm = nn.Dropout(cfg.dropout), nn.LayerNorm(cfg.embed_dim)
         self.embed_words = nn.Linear(text.cfg.dim, cfg.embed_dim)
         self.log_scale = nn.Parameter(torch.tensor(math.log(1 / 0.07)))
 
     def frames(self, x: Tensor, valid: Tensor | None = None) -> Tensor:
-        """Normalised features (B,T,263), valid (B,T) False on padding -> frame features (B,T,embed_dim).
+        """Normalised features (B,T,D), valid (B,T) False on padding -> frame features (B,T,embed_dim).
 
         No valid frame sees padding, whatever stands there. Padded frames get features too: those of zeros.
         ValueError: shapes that do not fit.
         """
-        _check(x, valid)
+        _check(x, valid, self.width)
         batch, frames = x.shape[:2]
         hidden = torch.full((1, frames, frames), self.cfg.causal, device=x.device).triu(1)
         if valid is not None:
@@ -191,8 +200,8 @@ def masked_mean(x: Tensor, mask: Tensor | None) -> Tensor:
     return (weights.unsqueeze(-1) * x).sum(1)
 
 
-def _check(x: Tensor, valid: Tensor | None) -> None:
-    if x.ndim != 3 or x.shape[-1] != NUM_FEATURES or x.shape[1] == 0:
-        raise ValueError(f"the teacher reads (batch, frames >= 1, {NUM_FEATURES}), got {tuple(x.shape)}")
+def _check(x: Tensor, valid: Tensor | None, width: int) -> None:
+    if x.ndim != 3 or x.shape[-1] != width or x.shape[1] == 0:
+        raise ValueError(f"the teacher reads (batch, frames >= 1, {width}), got {tuple(x.shape)}")
     if valid is not None and valid.shape != x.shape[:2]:
         raise ValueError(f"valid: expected shape {tuple(x.shape[:2])}, got {tuple(valid.shape)}")

@@ -234,7 +234,7 @@ def load_teacher(folder: Path, preset: Preset) -> MotionTeacher:
     """Load the teacher in eval mode, with the text encoder it was trained with. It learns no more."""
     text = TextEncoder.load(folder / "text", preset.text)
     try:
-        teacher = MotionTeacher(preset.tmr, text)
+        teacher = MotionTeacher(preset.tmr, text, preset.vae.input_dim)
     except ValueError as error:
         raise ValueError(f"{folder / 'card.json'} describes a teacher that cannot be built: {error}") from error
     words = {f"text.{key}": value for key, value in text.state_dict().items()}

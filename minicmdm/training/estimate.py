@@ -50,7 +50,8 @@ def estimate(plan: Preset, accumulate: int = 1) -> list[Estimate]:
     latents = MAX_FRAMES // group
 
     with FakeTensorMode():
-        teacher = MotionTeacher(plan.tmr, SimpleNamespace(cfg=plan.text))  # the words' side is not run
+        words_side = SimpleNamespace(cfg=plan.text)  # is not run
+        teacher = MotionTeacher(plan.tmr, words_side, plan.vae.input_dim)
         vae, dit = MACVAE(plan.vae), CausalDiT(plan.dit)
         frames = torch.empty(cfg.tmr_batch, MAX_FRAMES, plan.vae.input_dim)
         crops = torch.empty(cfg.vae_batch, cfg.crop_frames // group * group, plan.vae.input_dim)

@@ -99,6 +99,7 @@ def train(
 
     say("reading the data")
     train_set, val_set = _datasets(data, fast, progress)
+    plan = replace(plan, vae=replace(plan.vae, input_dim=len(train_set.mean)))  # 263, or KIT-ML's 251
     out.mkdir(parents=True, exist_ok=True)  # not sooner: what is wrong with the data leaves no folder behind
     say(f"{len(train_set.clips)} clips to train on, {len(val_set.clips)} to validate on")
     if progress and not fast:

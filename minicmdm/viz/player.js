@@ -1,9 +1,9 @@
 // Plays skeletons on canvases: drag to orbit, wheel to zoom, scrub, play, change speed. No library, no network.
 //
 // minicmdmPlayer(root, data) fills the element `root` and returns {seek, play, pause, destroy}. `data` is
-//   {fps, parents: [22], sides: [22] ("left" | "right" | "middle"), feet: [2],
+//   {fps, parents: [J], sides: [J] ("left" | "right" | "middle"), feet: [2], head,
 //    clips: [{caption, frames, scale, joints, contacts, noise}]}
-// joints: base64 of int16 (frames, 22, 3); times scale: metres. contacts: two digits a frame, left and right foot (0 in
+// joints: base64 of int16 (frames, J, 3); times scale: metres. contacts: two digits a frame, left and right foot (0 in
 // the air, 1 planted, 2 sliding). noise: base64 of a byte a frame (255 is pure noise), or null.
 // A page calls it from a script tag; a notebook widget appends `export default {render}` and calls it there.
 // root.dataset.frame holds the frame on show, for tests.
@@ -18,6 +18,7 @@ function minicmdmPlayer(root, data) {
   const clips = data.clips.map((clip) => ({
     ...clip, joints: decode(clip.joints, clip.scale), noise: clip.noise && bytesOf(clip.noise),
   }));
+  const stride = 3 * data.parents.length; // a frame
   const frames = Math.max(...clips.map((clip) => clip.frames));
   const view = { ...HOME };
   let now = 0; // in frames; between two of them while playing
@@ -147,9 +148,9 @@ function minicmdmPlayer(root, data) {
     const first = Math.min(Math.floor(time), last);
     const second = Math.min(first + 1, last);
     const part = Math.min(time, last) - first;
-    const pose = new Float32Array(66);
-    for (let i = 0; i < 66; i++) {
-      pose[i] = clip.joints[66 * first + i] * (1 - part) + clip.joints[66 * second + i] * part;
+    const pose = new Float32Array(stride);
+    for (let i = 0; i < stride; i++) {
+      pose[i] = clip.joints[stride * first + i] * (1 - part) + clip.joints[stride * second + i] * part;
     }
     return pose;
   }
@@ -206,7 +207,7 @@ function minicmdmPlayer(root, data) {
     drawFloor(context, project, pose, pixel);
 
     if (trail) { // where the root has been and will go, on the floor
-      const place = (t) => project(clip.joints[66 * t], 0, clip.joints[66 * t + 2]);
+      const place = (t) => project(clip.joints[stride * t], 0, clip.joints[stride * t + 2]);
       const [past, future] = [[], []];
       for (let t = 1; t < clip.frames; t++) (t <= now ? past : future).push([place(t - 1), place(t)]);
       lines(context, future, "rgba(180, 40, 90, 0.25)", 2 * pixel);
@@ -214,13 +215,13 @@ function minicmdmPlayer(root, data) {
     }
     if (contacts) drawContacts(context, project, pose, clip.contacts.slice(2 * frame, 2 * frame + 2), pixel);
     const bones = [];
-    for (let j = 1; j < 22; j++) bones.push([data.parents[j], j]);
+    for (let j = 1; j < data.parents.length; j++) bones.push([data.parents[j], j]);
     // A shadow straight below shows at once what floats or sinks.
     const below = bones.map(([p, j]) => [shadow(p), shadow(j)]);
     lines(context, below, "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
     bones.sort((a, b) => at(b[0]).away + at(b[1]).away - at(a[0]).away - at(a[1]).away); // far ones first
     for (const [p, j] of bones) lines(context, [[at(p), at(j)]], colour(data.sides[j]), 0.038 * at(j).size);
-    const head = at(15);
+    const head = at(data.head);
     if (head.away > 0.2) {
       context.fillStyle = colour("middle");
       context.beginPath();

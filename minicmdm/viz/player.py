@@ -13,10 +13,10 @@ from importlib import resources
 
 import numpy as np
 
-from minicmdm.data.skeleton import FPS, LEFT_JOINTS, NUM_JOINTS, PARENTS, RIGHT_JOINTS
-from minicmdm.evaluation.metrics import CONTACT_HEIGHT, FEET, SKATING_SPEED
+from minicmdm.data.skeleton import FPS, SKELETONS, SMPL22, skeleton_of
+from minicmdm.evaluation.metrics import CONTACT_HEIGHT, SKATING_SPEED
 
-SIDES = ["left" if j in LEFT_JOINTS else "right" if j in RIGHT_JOINTS else "middle" for j in range(NUM_JOINTS)]
+SIDES = SMPL22.sides
 
 _PAGE = """<!doctype html>
 <html lang="en">
@@ -49,9 +49,10 @@ def player_script() -> str:
 def foot_contacts(joints: np.ndarray, fps: float = FPS) -> np.ndarray:
     """What the left and the right foot do in each frame (T, 2): 0 in the air, 1 planted, 2 sliding over the floor.
 
-    Joints (T, 22, 3) in metres; the floor is y = 0. Heights and speeds are those of `metrics.skating_ratio`.
+    Joints (T, 22 or 21, 3) in metres; the floor is y = 0. Heights and speeds are those of `metrics.skating_ratio`.
     """
-    feet = np.asarray(joints, dtype=np.float64)[:, FEET]  # (T,2,3)
+    joints = np.asarray(joints, dtype=np.float64)
+    feet = joints[:, skeleton_of(joints.shape[1]).feet]  # (T,2,3)
     low = feet[..., 1] < CONTACT_HEIGHT
     speed = np.linalg.norm(np.diff(feet[..., [0, 2]], axis=0), axis=-1) * fps  # (T-1,2)
     step = low[:-1] & low[1:] & (speed > SKATING_SPEED)
@@ -65,10 +66,10 @@ def player_data(
     fps: float = FPS,
     noise: list[np.ndarray | None] | None = None,
 ) -> dict:
-    """What minicmdmPlayer draws, ready for JSON: motions (T, 22, 3) in metres as scaled int16 in base64.
+    """What minicmdmPlayer draws, ready for JSON: motions (T, 22, 3), or all (T, 21, 3), in metres as int16 in base64.
 
     `noise` holds for each motion how noisy its frames are, (T,) from 0 (clean) to 1, or None. ValueError when a motion
-    is not (T, 22, 3) and finite, a noise is not (T,) and within 0..1, or their numbers and the captions' differ.
+    is neither or not finite, a noise is not (T,) and within 0..1, or their numbers and the captions' differ.
     """
     joints_list = [np.asarray(joints, dtype=np.float64) for joints in joints_list]
     if not joints_list or len(joints_list) != len(captions):
@@ -78,10 +79,12 @@ def player_data(
         raise ValueError(f"expected one noise per motion or None, got {len(joints_list)} motions, {len(noise)} noises")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"fps must be a positive number of frames per second, got {fps}")
-    clips = []
+    clips, shapes = [], [(body.num_joints, 3) for body in SKELETONS]
     for index, (joints, caption, levels) in enumerate(zip(joints_list, captions, noise)):
-        if joints.ndim != 3 or joints.shape[1:] != (NUM_JOINTS, 3) or len(joints) == 0:
-            raise ValueError(f"motion {index} must have shape (T, {NUM_JOINTS}, 3), got {joints.shape}")
+        if joints.ndim != 3 or joints.shape[1:] not in shapes or len(joints) == 0:
+            told = " or ".join(f"(T, {count}, {three})" for count, three in shapes)
+            raise ValueError(f"motion {index} must have shape {told}, got {joints.shape}")
+        shapes = [joints.shape[1:]]  # of all that follow: one page shows one kind of body
         if not np.isfinite(joints).all():
             raise ValueError(f"motion {index} holds NaN or infinite numbers")
         scale = max(float(np.abs(joints).max()), 1e-6) / 32767  # 0.1 mm within 3 m of the origin
@@ -95,7 +98,9 @@ def player_data(
                 "noise": None if levels is None else _base64(np.uint8(np.round(255 * checked_noise(levels, joints)))),
             }
         )
-    return {"fps": float(fps), "parents": list(PARENTS), "sides": SIDES, "feet": list(FEET), "clips": clips}
+    body = skeleton_of(shapes[0][0])
+    shown = {"parents": list(body.parents), "sides": body.sides, "feet": list(body.feet), "head": body.head}
+    return {"fps": float(fps), **shown, "clips": clips}
 
 
 def checked_noise(levels: np.ndarray, joints: np.ndarray) -> np.ndarray:

@@ -12,16 +12,17 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from minicmdm.data.skeleton import FPS, LEFT_JOINTS, NUM_JOINTS, PARENTS, RIGHT_JOINTS
+from minicmdm.data.skeleton import FPS, SKELETONS, SMPL22, skeleton_of
 from minicmdm.viz.player import checked_noise
 
 PAPER, INK, SHADOW, TRAIL = (245, 246, 248), (31, 36, 48), (216, 219, 225), (205, 120, 150)
 LEFT, RIGHT, MIDDLE = (224, 122, 31), (37, 99, 201), (69, 75, 87)
 GRID, NOISE, CLEAN = (212, 216, 223), (176, 112, 126), (214, 218, 226)  # as player.js has them
-COLOURS = [LEFT if j in LEFT_JOINTS else RIGHT if j in RIGHT_JOINTS else MIDDLE for j in range(NUM_JOINTS)]
+OF_SIDE = {"left": LEFT, "right": RIGHT, "middle": MIDDLE}
+COLOURS = [OF_SIDE[side] for side in SMPL22.sides]
 
 YAW, PITCH, DISTANCE = 0.6, 0.22, 4.4  # where the camera stands: radians, radians, metres from the root
-HEAD_JOINT, HEAD_RADIUS, BONE_WIDTH = 15, 0.085, 0.04  # metres
+HEAD_JOINT, HEAD_RADIUS, BONE_WIDTH = SMPL22.head, 0.085, 0.04  # metres
 SMOOTH = 2  # drawn this many times too large, then reduced
 
 
@@ -46,7 +47,13 @@ def pose_strip(
     for column, frame in enumerate(np.linspace(0, len(joints) - 1, poses).round().astype(int)):
         picture = _draw_frame(joints, frame, width, height, levels[frame])
         pen = ImageDraw.Draw(picture)
-        pen.text((width / 2, height - 6), f"{frame / FPS:.1f} s", fill=INK, font=_font(11), anchor="ms")
+        pen.text(
+            (width / 2, height - 6),
+            f"{frame / skeleton_of(joints.shape[1]).fps:.1f} s",
+            fill=INK,
+            font=_font(11),
+            anchor="ms",
+        )
         strip.paste(picture, (column * width, 0))
     if noise is not None:  # the bar goes from the middle of the first pose to the middle of the last
         bar = np.uint8(np.round(CLEAN + levels[:, None] * np.subtract(NOISE, CLEAN)))[None]  # (1,T,3)
@@ -99,7 +106,9 @@ def save_loss_curves(csv_path: str | Path, png_path: str | Path) -> None:
 
 def _draw_frame(joints: np.ndarray, frame: int, width: int, height: int, noise: float = 0.0) -> Image.Image:
     """One frame in perspective, camera on the root: floor, path so far, shadow, bones from far to near."""
-    colours = [tuple(np.round(c + 0.85 * noise * np.subtract(NOISE, c)).astype(int)) for c in (*COLOURS, MIDDLE)]
+    body = skeleton_of(joints.shape[1])
+    clean = [*(OF_SIDE[side] for side in body.sides), MIDDLE]
+    colours = [tuple(np.round(c + 0.85 * noise * np.subtract(NOISE, c)).astype(int)) for c in clean]
     width, height = width * SMOOTH, height * SMOOTH
     picture = Image.new("RGB", (width, height), PAPER)
     pen = ImageDraw.Draw(picture)
@@ -118,12 +127,12 @@ def _draw_frame(joints: np.ndarray, frame: int, width: int, height: int, noise: 
         pen.line(project(on_floor)[0].ravel().tolist(), fill=TRAIL, width=2 * SMOOTH)
 
     shadow, scale = project(pose * [1, 0, 1])
-    for j in range(1, NUM_JOINTS):
-        pen.line([*shadow[PARENTS[j]], *shadow[j]], fill=SHADOW, width=round(BONE_WIDTH * scale[j]))
+    for j, parent in enumerate(body.parents[1:], start=1):
+        pen.line([*shadow[parent], *shadow[j]], fill=SHADOW, width=round(BONE_WIDTH * scale[j]))
     pixels, scale = project(pose)
-    for j in sorted(range(1, NUM_JOINTS), key=lambda j: scale[j] + scale[PARENTS[j]]):  # far ones first
-        _bone(pen, pixels[PARENTS[j]], pixels[j], colours[j], BONE_WIDTH * scale[j])
-    _disc(pen, pixels[HEAD_JOINT], HEAD_RADIUS * scale[HEAD_JOINT], colours[-1])
+    for j in sorted(range(1, body.num_joints), key=lambda j: scale[j] + scale[body.parents[j]]):  # far ones first
+        _bone(pen, pixels[body.parents[j]], pixels[j], colours[j], BONE_WIDTH * scale[j])
+    _disc(pen, pixels[body.head], HEAD_RADIUS * scale[body.head], colours[-1])
     return picture.reduce(SMOOTH)
 
 
@@ -198,8 +207,8 @@ def _with_caption(picture: Image.Image, caption: str) -> Image.Image:
 
 def _checked(joints: np.ndarray) -> np.ndarray:
     joints = np.asarray(joints, dtype=np.float64)
-    if joints.ndim != 3 or joints.shape[1:] != (NUM_JOINTS, 3) or len(joints) == 0:
-        raise ValueError(f"joints must have shape (T, {NUM_JOINTS}, 3) in metres, got {joints.shape}")
+    if joints.ndim != 3 or joints.shape[1:] not in [(body.num_joints, 3) for body in SKELETONS] or len(joints) == 0:
+        raise ValueError(f"joints must have shape (T, 22, 3) or (T, 21, 3) in metres, got {joints.shape}")
     if not np.isfinite(joints).all():
         raise ValueError("joints hold NaN or infinite numbers, which cannot be drawn")
     return joints
