@@ -59,10 +59,6 @@ def stream(arguments: argparse.Namespace) -> None:
     from minicmdm.files import check_output, whole_file
 
     out = None if arguments.out is None else check_output(arguments.out, (".jsonl", ".npy"), arguments.force)
-    lines = _timeline(arguments.file)
-    first = next(lines, None)
-    if first is None:
-        raise ValueError("no prompt came: give lines of seconds, a tab and a prompt, like '4<TAB>a person walks'")
     _one_thread()
     import numpy as np
 
@@ -70,6 +66,11 @@ def stream(arguments: argparse.Namespace) -> None:
     from minicmdm.pipeline import MotionPipeline
 
     pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+    body = pipe.skeleton
+    lines = _timeline(arguments.file, body.fps)
+    first = next(lines, None)
+    if first is None:
+        raise ValueError("no prompt came: give lines of seconds, a tab and a prompt, like '4<TAB>a person walks'")
     flow = pipe.stream(
         first[1],
         lasts=first[0],
@@ -90,7 +91,7 @@ def stream(arguments: argparse.Namespace) -> None:
     with whole_file(out) as temporary, open(temporary, "wb") as file:
 
         def header() -> None:
-            shape = {"descr": "<f4", "fortran_order": False, "shape": (count, 22, 3)}
+            shape = {"descr": "<f4", "fortran_order": False, "shape": (count, body.num_joints, 3)}
             np.lib.format.write_array_header_1_0(file, shape)  # numpy leaves room for a count that grows
 
         if out.suffix.lower() == ".npy":
@@ -102,19 +103,19 @@ def stream(arguments: argparse.Namespace) -> None:
         if out.suffix.lower() == ".npy":
             file.seek(0)
             header()
-    say(f"wrote {out} ({count} frames, {count / 20:.1f} s)")
+    say(f"wrote {out} ({count} frames, {count / body.fps:.1f} s)")
 
 
-def _timeline(name: str) -> Iterator[tuple[int, str]]:
+def _timeline(name: str, fps: float) -> Iterator[tuple[int, str]]:
     """The (frames, prompt) of each line of a file, or of "-", stdin, whose lines are read one by one as they come."""
     from minicmdm.live import timeline
 
     if name == "-":
-        return timeline(getattr(sys.stdin, "buffer", sys.stdin))
+        return timeline(getattr(sys.stdin, "buffer", sys.stdin), fps)
     if not Path(name).is_file():
         raise FileNotFoundError(f"no file {name}: lines of seconds, a tab and a prompt were expected there")
     with open(name, "rb") as file:
-        return iter(list(timeline(file)))  # a bad line is refused before any work
+        return iter(list(timeline(file, fps)))  # a bad line is refused before any work
 
 
 def demo(arguments: argparse.Namespace) -> None:

@@ -9,10 +9,11 @@ import numpy as np
 from torch import Tensor
 
 from minicmdm.data.features import essential, features_to_joints, turn
+from minicmdm.data.skeleton import FPS
 from minicmdm.diffusion.streaming import LatentStream
 from minicmdm.models.layers import States
 
-FPS, LONGEST = 20, 86_400  # frames per second; a line of a timeline may last a day
+LONGEST = 86_400  # seconds: a line of a timeline may last a day
 USUAL = 60  # frames, the median of the training set's segments: to walk for ever is to walk again and again
 
 
@@ -89,7 +90,7 @@ def latents_before(frame: int) -> int:
     return (frame + 1) // 4
 
 
-def timeline(lines: Iterable[bytes | str]) -> Iterator[tuple[int, str]]:
+def timeline(lines: Iterable[bytes | str], fps: float = FPS) -> Iterator[tuple[int, str]]:
     """The (frames, prompt) of every line "seconds<TAB>prompt", as they come. ValueError: a line that says neither."""
     for number, line in enumerate(lines, start=1):
         try:
@@ -100,10 +101,10 @@ def timeline(lines: Iterable[bytes | str]) -> Iterator[tuple[int, str]]:
             continue
         seconds, tab, prompt = line.strip().partition("\t")
         try:
-            frames = round(float(seconds) * FPS)
+            frames = round(float(seconds) * fps)
         except (ValueError, OverflowError):  # no number, or an infinite one
             frames = 0
-        if not tab or not prompt.strip() or not 1 <= frames <= LONGEST * FPS:
+        if not tab or not prompt.strip() or not 1 <= frames <= LONGEST * fps:
             expected = f"seconds (0.05 to {LONGEST}), a tab and a prompt"
             raise ValueError(f"line {number}: expected {expected}, and {line.strip()[:80]!r} came")
         yield frames, prompt.strip()

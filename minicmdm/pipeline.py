@@ -21,7 +21,7 @@ from torch import Tensor
 
 import minicmdm
 from minicmdm.data.features import features_to_joints
-from minicmdm.data.skeleton import skeleton_of
+from minicmdm.data.skeleton import Skeleton, skeleton_of
 from minicmdm.diffusion.sampling import SOLVERS, Denoise, from_noise_prediction, guided, sample
 from minicmdm.diffusion.schedules import schedule_matrix
 from minicmdm.diffusion.streaming import LatentStream
@@ -61,6 +61,11 @@ class MotionPipeline:
         if str(name) == "toy" and not (folder / "card.json").is_file():
             folder = ASSETS / "toy"
         return cls(checkpoints.load_checkpoint(folder))
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """The body that its training data had, with its frame rate."""
+        return skeleton_of(self.preset.vae.input_dim)
 
     def save_pretrained(self, folder: str | Path) -> Path:
         """Write the checkpoint (weights, text encoder, statistics, card) into a folder, made if missing."""
@@ -131,7 +136,7 @@ class MotionPipeline:
             for i, count, one in zip(chosen, counts, latents):  # a VAE that looks ahead must not see padding
                 features = self.decode(one[None, :count])[0, : frames[i]].numpy()  # (T,D)
                 joints = features_to_joints(features).astype(np.float32)  # (T,22,3)
-                motions[i] = Motion(joints, features, prompts[i], skeleton_of(joints.shape[1]).fps)
+                motions[i] = Motion(joints, features, prompts[i], self.skeleton.fps)
         return motions[0] if single else [motions[i] for i in range(len(prompts))]
 
     def stream(

@@ -12,6 +12,7 @@ from minicmdm.data.clips import MotionDataset
 from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.folders import load_dataset, write_folder
+from minicmdm.motion import load_joints
 from minicmdm.pipeline import MotionPipeline
 from minicmdm.training import stages
 
@@ -64,8 +65,10 @@ def test_what_it_generates_has_the_data_sets_body_rate_and_size(run, tmp_path):
     if joints == 21:
         with pytest.raises(ValueError, match="22, 3"):
             motion.save(tmp_path / "x.bvh")
-    frames = [frame for frame, _ in zip(pipe.stream("a person walks"), range(9))]
-    assert {frame.shape for frame in frames} == {(joints, 3)}
+    (tmp_path / "plan.tsv").write_text("2\ta person walks\n", encoding="utf-8")
+    order = ["stream", str(tmp_path / "plan.tsv"), "--checkpoint", str(run / "run"), "--out", str(tmp_path / "s.npy")]
+    assert main(order) == 0
+    assert load_joints(tmp_path / "s.npy").shape == (2 * fps, joints, 3)  # two seconds
 
 
 def test_it_is_judged_by_its_own_judges(run, capsys):

@@ -10,8 +10,9 @@ export default {
     const COLOURS = { left: "#e07a1f", right: "#2563c9", middle: "#454b57" };
     const TRAIL = 160; // frames of the way behind it
     const plan = model.get("plan");
+    const stride = 3 * plan.parents.length;
     const view = { yaw: 0.6, pitch: 0.24, distance: 4.2 };
-    let frames = []; // poses of 66 numbers; frames[0] is frame number `first`
+    let frames = []; // poses of `stride` numbers; frames[0] is frame number `first`
     let first = 0;
     let told = [[0, plan.prompt]]; // [first frame that hears it, sentence]
     let now = 0; // the time on show, in frames
@@ -79,9 +80,9 @@ export default {
     function take(bytes, number) { // a DataView of float32, whose bytes may begin anywhere
       if (number <= last()) return; // another view asked for these too, and they are here
       if (number > last() + 1 && frames.length) [frames, first, now] = [[], number, number]; // a view that was away
-      for (let at = 0; at + 264 <= bytes.byteLength; at += 264) {
-        const pose = new Float32Array(66);
-        for (let i = 0; i < 66; i++) pose[i] = bytes.getFloat32(at + 4 * i, true);
+      for (let at = 0; at + 4 * stride <= bytes.byteLength; at += 4 * stride) {
+        const pose = new Float32Array(stride);
+        for (let i = 0; i < stride; i++) pose[i] = bytes.getFloat32(at + 4 * i, true);
         frames.push(pose);
       }
       const old = Math.floor(now) - TRAIL - first;
@@ -176,11 +177,11 @@ export default {
       const joint = (j) => project(pose[3 * j], pose[3 * j + 1], pose[3 * j + 2]);
       const shadow = (j) => project(pose[3 * j], 0, pose[3 * j + 2]);
       const bones = [];
-      for (let j = 1; j < 22; j++) bones.push({ j, ends: [joint(plan.parents[j]), joint(j)], below: [shadow(plan.parents[j]), shadow(j)] });
+      for (let j = 1; j < plan.parents.length; j++) bones.push({ j, ends: [joint(plan.parents[j]), joint(j)], below: [shadow(plan.parents[j]), shadow(j)] });
       stroke(pen, bones.map((bone) => bone.below), "rgba(30, 35, 50, 0.15)", 0.05 * shadow(0).size);
       bones.sort((a, b) => b.ends[0].away + b.ends[1].away - a.ends[0].away - a.ends[1].away); // far ones first
       for (const { j, ends } of bones) stroke(pen, [ends], COLOURS[plan.sides[j]], 0.038 * ends[1].size);
-      const head = joint(15);
+      const head = joint(plan.head);
       pen.fillStyle = COLOURS.middle;
       pen.beginPath();
       pen.arc(head.x, head.y, 0.085 * head.size, 0, 7);

@@ -17,9 +17,8 @@ from importlib import resources
 import numpy as np
 from PIL import Image
 
-from minicmdm.data.skeleton import FPS, PARENTS
+from minicmdm.data.skeleton import skeleton_of
 from minicmdm.live import USUAL
-from minicmdm.viz.player import SIDES
 from minicmdm.viz.plots import pose_strip
 from minicmdm.viz.widgets import _with_png, anywidget, traitlets
 
@@ -83,7 +82,9 @@ class LiveStream(anywidget.AnyWidget):
         first = actor.chunk(OPENING)
         super().__init__()
         self.actor, self._first, self._prompt = actor, first, prompt
-        self.plan = {"fps": FPS, "low": LOW, "prompt": prompt, "parents": list(PARENTS), "sides": SIDES}
+        body = skeleton_of(first.shape[1])
+        self.plan = {"fps": body.fps, "low": LOW, "prompt": prompt, "head": body.head}
+        self.plan |= {"parents": list(body.parents), "sides": body.sides}
         self.opening = first.tobytes()
         self.on_msg(self._answer)
 

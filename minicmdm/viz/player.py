@@ -13,10 +13,8 @@ from importlib import resources
 
 import numpy as np
 
-from minicmdm.data.skeleton import FPS, SKELETONS, SMPL22, skeleton_of
+from minicmdm.data.skeleton import FPS, SKELETONS, skeleton_of
 from minicmdm.evaluation.metrics import CONTACT_HEIGHT, SKATING_SPEED
-
-SIDES = SMPL22.sides
 
 _PAGE = """<!doctype html>
 <html lang="en">
