@@ -141,6 +141,9 @@ def _parser() -> Parser:
     sub.add_argument("--data", help="a folder in HumanML3D's layout (default: the toy world)")
     sub.add_argument("--text", help="a pretrained text encoder, kept as it is: minilm, a folder, or a hub name")
     sub.add_argument("--seed", type=int, help="seed of weights and batches (default: the preset's)")
+    sub.add_argument(
+        "--bf16", action="store_true", help="compute in bfloat16; weights stay float32 (toy and micro always)"
+    )
     sub.add_argument("--compile", action="store_true", help="train faster; needs a C++ compiler on this machine")
     sub.add_argument(
         "--threads", type=int, default=1, help="CPU threads; on one, a run repeats bit for bit (default 1)"

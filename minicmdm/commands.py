@@ -218,6 +218,7 @@ def train(arguments: argparse.Namespace) -> None:
         data=arguments.data,
         seed=arguments.seed,
         compile=arguments.compile,
+        bf16=arguments.bf16,
         accumulate=arguments.accumulate,
         device=arguments.device,
         text=arguments.text,

@@ -1,17 +1,20 @@
 """Several processes train as one does: the same losses, the same weights, one set of files."""
 
 import csv
+import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import pytest
 import torch
+from conftest import make_fake_data
 from torch import nn
 
 from minicmdm.training import stages
 from minicmdm.training.checkpoints import load_tensors
-from minicmdm.training.loop import LoopConfig, fit
+from minicmdm.training.loop import LoopConfig, LoopResult, fit
 from minicmdm.training.team import Team
 
 SCRIPT = """
@@ -154,3 +157,15 @@ def test_training_asks_for_a_device_before_it_touches_anything(tmp_path):
     with pytest.raises(ValueError, match="no device"):
         stages.train("micro", tmp_path / "run", fast=True, device="abacus")
     assert not (tmp_path / "run").exists()
+
+
+def test_bf16_is_a_flag_and_the_card_tells(tiny_preset, tmp_path, monkeypatch):
+    told = []
+    plan = replace(tiny_preset, train=replace(tiny_preset.train, bfloat16=False))
+    monkeypatch.setattr(stages, "_datasets", lambda *_: (make_fake_data(6), make_fake_data(4, seed=1)))
+    monkeypatch.setitem(
+        stages.RUN, "tmr", lambda plan, *_, **__: told.append(plan.train.bfloat16) or LoopResult({}, {}, 0.0)
+    )
+    for bf16 in (False, True):
+        out = stages.train(plan, tmp_path / str(bf16), "tmr", bf16=bf16, progress=False)
+        assert json.loads((out / "card.json").read_text())["preset"]["train"]["bfloat16"] == told[-1] == bf16

@@ -51,6 +51,7 @@ def train(
     data: str | Path | None = None,
     seed: int | None = None,
     compile: bool = False,
+    bf16: bool = False,
     accumulate: int | None = None,
     device: str = "cpu",
     text: str | None = None,
@@ -62,7 +63,7 @@ def train(
     """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
-    `compile` makes the denoiser's steps shorter, where there is a C++ compiler.
+    `compile` makes the denoiser's steps shorter, where there is a C++ compiler; `bf16` computes in bfloat16.
     `accumulate`, `device`, `workers`: see team.py.
     `text` names a pretrained text encoder ("minilm", a folder, a hub name that is on this machine) that stays frozen.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
@@ -71,6 +72,7 @@ def train(
     if stage not in STAGES:
         raise ValueError(f"unknown stage {stage!r}: expected one of {', '.join(STAGES)}")
     own = {"seed": plan.train.seed if seed is None else seed, "compile": compile or plan.train.compile}
+    own["bfloat16"] = bf16 or plan.train.bfloat16
     plan = replace(plan, train=replace(plan.train, **own))
     if fast:
         plan = replace(plan, train=replace(plan.train, **FAST))
