@@ -83,8 +83,8 @@ class LiveStream(anywidget.AnyWidget):
         super().__init__()
         self.actor, self._first, self._prompt = actor, first, prompt
         body = skeleton_of(first.shape[1])
-        self.plan = {"fps": body.fps, "low": LOW, "prompt": prompt, "head": body.head}
-        self.plan |= {"parents": list(body.parents), "sides": body.sides}
+        shown = {"parents": list(body.parents), "sides": body.sides, "head": body.head}
+        self.plan = {"fps": body.fps, "low": LOW, "prompt": prompt, **shown}  # a trait misses later changes
         self.opening = first.tobytes()
         self.on_msg(self._answer)
 
