@@ -30,8 +30,8 @@ from minicmdm.files import write_text
 from minicmdm.models.layers import sinusoid
 from minicmdm.models.tmr import MAX_SCALE, contrastive_loss
 from minicmdm.training.checkpoints import checksum, load_tensors, load_weights, save_tensors
+from minicmdm.training.distributed import ALONE, Team
 from minicmdm.training.loop import LoopConfig, LoopResult, fit, step_key
-from minicmdm.training.team import ALONE, Team
 
 FORMAT = "minicmdm-bench-1"
 ESSENTIAL = 67  # root and joint positions, the first of the 263: all that a skeleton is drawn from (MARDM)

@@ -16,8 +16,8 @@ from minicmdm.models.text import TextEncoder, Words
 from minicmdm.models.wordcache import WordCache
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import DenoiserBatch, draw_batch, encode_dataset, said, words_per_latent
+from minicmdm.training.distributed import ALONE, Team
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
-from minicmdm.training.team import ALONE, Team
 
 
 def train_dit(

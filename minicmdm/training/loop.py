@@ -27,8 +27,8 @@ from tqdm import tqdm
 from minicmdm.config import Preset
 from minicmdm.files import whole_file
 from minicmdm.training.checkpoints import load_tensors, save_tensors
+from minicmdm.training.distributed import ALONE, Team
 from minicmdm.training.muon import Muon, inner_matrices
-from minicmdm.training.team import ALONE, Team
 
 
 @dataclass(frozen=True)

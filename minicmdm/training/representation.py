@@ -27,8 +27,8 @@ from minicmdm.models.vae import MACVAE, vae_loss
 from minicmdm.models.wordcache import WordCache
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import crop_features, draw_captioned, encode_dataset, said
+from minicmdm.training.distributed import ALONE, Team
 from minicmdm.training.loop import LoopResult, fit, loop_config, step_key
-from minicmdm.training.team import ALONE, Team
 
 
 def train_teacher(

@@ -25,9 +25,9 @@ from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.models.text import find_encoder, with_encoder
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
+from minicmdm.training.distributed import Team
 from minicmdm.training.estimate import estimate
 from minicmdm.training.representation import train_teacher, train_vae
-from minicmdm.training.team import Team
 
 RUN = {"evaluator": train_bench, "tmr": train_teacher, "vae": train_vae, "dit": train_dit}
 NEEDS = {"evaluator": (), "tmr": (), "vae": ("tmr.safetensors",), "dit": ("vae.safetensors", "text/model.safetensors")}
@@ -64,7 +64,7 @@ def train(
 
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
     `compile` makes the denoiser's steps shorter, where there is a C++ compiler; `bf16` computes in bfloat16.
-    `accumulate`, `device`, `workers`: see team.py.
+    `accumulate`, `device`, `workers`: see distributed.py.
     `text` names a pretrained text encoder ("minilm", a folder, a hub name that is on this machine) that stays frozen.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """

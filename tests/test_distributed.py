@@ -14,8 +14,8 @@ from torch import nn
 
 from minicmdm.training import stages
 from minicmdm.training.checkpoints import load_tensors
+from minicmdm.training.distributed import Team
 from minicmdm.training.loop import LoopConfig, LoopResult, fit
-from minicmdm.training.team import Team
 
 SCRIPT = """
 import sys
