@@ -4,7 +4,8 @@ A configuration is plain data. It holds no tensor and knows no module, so a chec
 (`Preset.to_dict`) and a reader can compare two models by comparing two dictionaries.
 """
 
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, field, fields, replace
 
 
 @dataclass(frozen=True)
@@ -149,30 +150,27 @@ class Preset:
 
     @classmethod
     def from_dict(cls, data: dict) -> "Preset":
-        """The inverse of `to_dict`. ValueError: an unknown or missing key, named with where it stood."""
-        _check_keys(cls, data, "preset")
+        """The inverse of `to_dict`. ValueError: an unknown key, or a part missing, named with where it stood.
+
+        A number that an older version did not know yet has its default, which means what was done before there was a
+        choice: an old checkpoint stays what it was.
+        """
         parts = {"vae": VAEConfig, "text": TextConfig, "tmr": TMRConfig, "dit": DiTConfig, "train": TrainConfig}
+        _check_keys(cls, data, "preset", needed={"name", *parts})
         for key, part in parts.items():
             _check_keys(part, data[key], key)
-        train = {**data["train"], "betas": tuple(data["train"]["betas"])}
-        return cls(
-            name=data["name"],
-            vae=VAEConfig(**data["vae"]),
-            text=TextConfig(**data["text"]),
-            tmr=TMRConfig(**data["tmr"]),
-            dit=DiTConfig(**data["dit"]),
-            train=TrainConfig(**train),
-        )
+        made = {key: part(**data[key]) for key, part in parts.items()}
+        train = replace(made["train"], betas=tuple(made["train"].betas))  # JSON has lists only
+        return cls(**{"name": data["name"], **made, "train": train})
 
 
-def _check_keys(cls, data, where: str):
+def _check_keys(cls, data, where: str, needed: Collection[str] = ()):
     if not isinstance(data, dict):
         raise ValueError(f"configuration {where!r}: expected a dictionary, got {type(data).__name__}")
     expected, found = {f.name for f in fields(cls)}, set(data)
-    if expected != found:
-        raise ValueError(
-            f"configuration {where!r}: missing keys {sorted(expected - found)}, unknown keys {sorted(found - expected)}"
-        )
+    missing, unknown = expected - found, found - expected
+    if unknown or missing & set(needed):
+        raise ValueError(f"configuration {where!r}: missing keys {sorted(missing)}, unknown keys {sorted(unknown)}")
 
 
 def _paper(name: str, heads: int, layers: int, dim: int) -> Preset:

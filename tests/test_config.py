@@ -48,6 +48,15 @@ def test_a_foreign_dictionary_is_refused_by_the_key_that_is_wrong():
         Preset.from_dict({**preset("toy").to_dict(), "vae": 3})
 
 
+def test_what_an_older_version_did_not_know_is_as_it_was_then():
+    data = preset("toy").to_dict()
+    for part, key in (("train", "accumulate"), ("train", "word_drop"), ("dit", "path")):
+        del data[part][key]
+    assert Preset.from_dict(data) == preset("toy")
+    with pytest.raises(ValueError, match="'preset': missing keys .'vae'"):
+        Preset.from_dict({key: value for key, value in preset("toy").to_dict().items() if key != "vae"})
+
+
 def test_parts_that_do_not_fit_are_refused():
     toy = preset("toy")
     with pytest.raises(ValueError, match="channels per latent"):
