@@ -16,6 +16,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_bvh import GOOD
 
 from minicmdm import cli
 from minicmdm.data import bvh, folders, imports
@@ -26,27 +27,6 @@ from minicmdm.motion import load_joints
 from minicmdm.pipeline import ASSETS
 from minicmdm.training.checkpoints import load_tensors, read_card, read_preset, save_tensors
 
-BVH = """HIERARCHY
-ROOT hips
-{
-  OFFSET 0 0 0
-  CHANNELS 3 Xposition Yposition Zposition
-  JOINT knee
-  {
-    OFFSET 0 1 0
-    CHANNELS 3 Zrotation Xrotation Yrotation
-    End Site
-    {
-      OFFSET 0 1 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.05
-0 1 0 90 0 0
-0 1 0.1 80 0 0
-"""
 LABEL = {"start_t": 0.5, "end_t": 2.0, "raw_label": "walk", "proc_label": "walk"}
 SEGMENT = {"action": "walk", "side": "left", "direction": None, "speed": "slow", "count": 2, "overlay": None}
 
@@ -82,6 +62,10 @@ def good_captions(found):
     return said and all(text.strip() for text in said) and all(0 <= a < b <= 64 for a, b in stretches)
 
 
+def good_map(places):
+    return all(isinstance(where, str) or len(where) == 3 for where in places.values())
+
+
 # What a reader reads, how, and what must hold of whatever it returns.
 READERS = {
     "1.npy": (lambda _: npy(np.zeros((64, 263), np.float32)), folders.read_features, good_features),
@@ -106,8 +90,8 @@ READERS = {
         folders.babel_labels,
         lambda found: all(a < b for rows in found.values() for a, b, _ in rows),
     ),
-    "a.bvh": (lambda _: BVH, bvh.read_bvh, lambda x: np.isfinite(x.frames).all() and len(x.frames) == 2),
-    "map.json": (lambda _: json.dumps({"head": "Head", "neck": ["a", "b", 0.5]}), imports.load_map, len),
+    "a.bvh": (lambda _: GOOD, bvh.read_bvh, lambda x: np.isfinite(x.frames).all() and len(x.frames) == 2),
+    "map.json": (lambda _: json.dumps({"head": "Head", "neck": ["a", "b", 0.5]}), imports.load_map, good_map),
     "captions.csv": (
         lambda _: 'name,caption\nwalk,"he, she"\nrun.bvh,they run\n',
         imports.read_csv,
@@ -159,7 +143,7 @@ def test_a_changed_file_is_read_or_refused(name, tmp_path_factory):
     def attempt(edits):
         path.write_bytes(edits if isinstance(edits, bytes) else edited(raw, edits))
         with contextlib.suppress(ValueError, FileNotFoundError):
-            assert good(read(path)) or name == "map.json"
+            assert good(read(path))
 
     attempt()
 
@@ -175,7 +159,9 @@ def test_a_changed_text_encoder_is_read_or_refused(part, tiny_run, tiny_preset, 
     def attempt(edits):
         (folder / part).write_bytes(edited(raw, edits))
         with contextlib.suppress(ValueError, FileNotFoundError):
-            TextEncoder.load(folder, tiny_preset.text)
+            encoder = TextEncoder.load(folder, tiny_preset.text)
+            assert encoder.cfg == tiny_preset.text and not encoder.training
+            assert all(torch.isfinite(weight).all() for weight in encoder.state_dict().values())
 
     attempt()
 
@@ -190,7 +176,8 @@ def test_changed_judges_are_read_or_refused(tiny_run, tmp_path_factory):
     def attempt(edits):
         (folder / "card.json").write_bytes(edited(raw, edits))
         with contextlib.suppress(ValueError, FileNotFoundError):
-            load_bench(folder)
+            for name, judge in load_bench(folder).items():
+                assert (folder / f"{name}.safetensors").is_file() and not judge.training
 
     attempt()
 
@@ -253,7 +240,7 @@ def cheap(tmp_path, monkeypatch, tiny_pipe, fake_data):
     Path("set/texts/1.txt").write_bytes(sample("1.txt", tmp_path))
     for name in ("train", "val", "test"):
         Path(f"set/{name}.txt").write_text("1\n")
-    Path("bvh/a.bvh").write_text(BVH)
+    Path("bvh/a.bvh").write_text(GOOD)
     for name in ("joints.npy", "plan.tsv"):
         Path(name).write_bytes(sample(name, tmp_path))
     yield
