@@ -1,4 +1,4 @@
-"""The command line: `minicmdm demo | generate | stream | inspect | schedule | data | import-bvh | train | ...`.
+"""The command line: `minicmdm demo | generate | stream | edit | inspect | schedule | data | import-bvh | train | ...`.
 
 Three habits hold for every command. What others parse (JSON, a matrix) goes to stdout; what people read while they wait
 goes to stderr. Whatever is wrong with a request is said in one line that begins "minicmdm: ", the exit code is 2, and
@@ -13,9 +13,11 @@ import sys
 from collections.abc import Callable
 from typing import NoReturn
 
-from minicmdm.commands import bench, demo, evaluate, generate, inspect, say, schedule, stream, train
+from minicmdm.commands import demo, edit, generate, inspect, say, schedule, stream, train
 from minicmdm.data_commands import data_info, data_make, doctor, import_bvh
+from minicmdm.measure_commands import bench, evaluate
 
+CHECKPOINT = "toy, flood, mardm, cdamd, or a folder made by `minicmdm train` (default toy)"
 WRONG, INTERRUPTED, READER_GONE = 2, 130, 141  # exit codes; the last two are what a shell reports for the signals
 
 
@@ -72,14 +74,12 @@ def _parser() -> Parser:
 
     def sampling(sub: Parser, schedules: str) -> None:
         sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
-        sub.add_argument("--steps", type=int, default=20, help="K, denoising steps of each latent (default 20)")
-        sub.add_argument(
-            "--uncertainty", type=int, default=2, help="L, how many steps later the next latent starts (default 2)"
-        )
+        sub.add_argument("--steps", type=int, help="K, denoising steps of each latent (default 20)")
+        sub.add_argument("--uncertainty", type=int, help="L, how many steps later the next latent starts (default 2)")
         sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
-        sub.add_argument("--schedule", default="fss", help=f"{schedules} (default fss)")
+        sub.add_argument("--schedule", help=f"{schedules} (default: the system's, of cmdm fss)")
         sub.add_argument("--block", type=int, help="latents that are denoised together (default: the model's own)")
-        sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
+        sub.add_argument("--checkpoint", default="toy", help=CHECKPOINT)
         sub.add_argument("--force", action="store_true", help="replace an output that exists")
 
     sub = command("generate", generate, "Turn a sentence into a motion: an .html player, .gif, .bvh or .npy of joints.")
@@ -95,6 +95,16 @@ def _parser() -> Parser:
     sub.add_argument("--out", help="write a .jsonl or .npy file rather than to stdout")
     sub.add_argument("--window", type=int, help="the most latents that one call sees (default 49, or those in flight)")
     sampling(sub, "fss, autoregressive or triangular")
+
+    sub = command("edit", edit, "Keep a part of a motion and make the rest of it anew, for a sentence.")
+    sub.add_argument("file", metavar="FILE", help="an .npy of joints in metres, 16 to 196 frames")
+    sub.add_argument("prompt", metavar="PROMPT", help="what all of the motion is to be")
+    sub.add_argument("--given", default="first_half", help="first_half, second_half, ends or middle is kept")
+    sub.add_argument("--out", default="edited.html", help=".html, .gif, .bvh or .npy (default edited.html)")
+    sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
+    sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
+    sub.add_argument("--checkpoint", default="mardm", help="mardm, cdamd, toy, flood or a folder (default mardm)")
+    sub.add_argument("--force", action="store_true", help="replace an output that exists")
 
     sub = command("inspect", inspect, "Read a motion back: what does the oracle see in an .npy of joints (T,22,3)?")
     sub.add_argument("file", metavar="FILE", help="an .npy of joints in metres")
@@ -132,6 +142,7 @@ def _parser() -> Parser:
 
     sub = command("train", train, "Train a preset from nothing: judges, teacher, VAE, denoiser.")
     sub.add_argument("--preset", default="toy", help="toy, micro, S, M, L or XL (default toy)")
+    sub.add_argument("--system", default="cmdm", help="cmdm, flood, mardm or cdamd (default cmdm)")
     sub.add_argument("--out", required=True, help="checkpoint folder to make")
     sub.add_argument("--stage", default="all", help="evaluator, tmr, vae, dit or all (default all)")
     sub.add_argument("--resume", action="store_true", help="go on with the run in --out")
@@ -154,7 +165,8 @@ def _parser() -> Parser:
     sub.add_argument("--accumulate", type=int, help="batches whose gradients make one step; processes share them")
 
     sub = command("evaluate", evaluate, "Measure a checkpoint: does the motion do what its sentence asked?")
-    sub.add_argument("--checkpoint", default="toy", help="toy, or a folder made by `minicmdm train` (default toy)")
+    sub.add_argument("--checkpoint", default="toy", help=CHECKPOINT)
+    sub.add_argument("--compare", action="store_true", help="the four shipped systems, side by side")
     sub.add_argument(
         "--data", help="a folder whose test.txt to answer; judges: `train --stage evaluator` (default: the toy world)"
     )

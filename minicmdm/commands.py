@@ -54,6 +54,26 @@ def generate(arguments: argparse.Namespace) -> None:
     say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
 
 
+def edit(arguments: argparse.Namespace) -> None:
+    """`minicmdm edit`: a part of a motion stays, the rest is made anew."""
+    from minicmdm.files import check_output
+    from minicmdm.motion import ENDINGS, Motion, load_joints
+
+    prompt = _as_typed(arguments.prompt)
+    out = check_output(arguments.out, ENDINGS, arguments.force)
+    joints = load_joints(arguments.file)
+    _one_thread()
+    from minicmdm.pipeline import MotionPipeline
+
+    pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
+    if joints.shape[1] != (count := pipe.skeleton.num_joints):
+        raise ValueError(f"{arguments.file} has {joints.shape[1]} joints, and {arguments.checkpoint} moves {count}")
+    how = {"guidance_scale": arguments.guidance, "seed": arguments.seed}
+    motion = pipe.edit(Motion(joints, fps=pipe.skeleton.fps), arguments.given, prompt, **how)
+    motion.save(out, force=arguments.force)
+    say(f"wrote {out} ({len(motion)} frames, of which the {arguments.given.replace('_', ' ')} was given)")
+
+
 def stream(arguments: argparse.Namespace) -> None:
     """`minicmdm stream`: a timeline of prompts in, frames out as they come, until the timeline ends."""
     from minicmdm.files import check_output, whole_file
@@ -199,7 +219,7 @@ def train(arguments: argparse.Namespace) -> None:
         from minicmdm.models.text import with_encoder
         from minicmdm.training.estimate import estimate
 
-        plan = preset(arguments.preset)
+        plan = preset(arguments.preset, arguments.system)
         if arguments.text is not None:
             plan = with_encoder(plan, arguments.text)
         for line in estimate(plan, arguments.accumulate or 1):
@@ -217,6 +237,7 @@ def train(arguments: argparse.Namespace) -> None:
         fast=arguments.fast,
         data=arguments.data,
         seed=arguments.seed,
+        system=arguments.system,
         compile=arguments.compile,
         bf16=arguments.bf16,
         accumulate=arguments.accumulate,
@@ -227,70 +248,3 @@ def train(arguments: argparse.Namespace) -> None:
         say=say,
     )
     say(f"wrote {out}")
-
-
-def evaluate(arguments: argparse.Namespace) -> None:
-    """`minicmdm evaluate`: the protocols as a table or JSON; with --quick, the flat numbers of a short one."""
-    from minicmdm.files import check_output, write_text
-
-    out = None if arguments.out is None else check_output(arguments.out, (".json", ".txt"), arguments.force)
-    named = ("protocol", "evaluator", "repeats", "compositions", "prompts_each")
-    asked = {key: value for key in named if (value := getattr(arguments, key)) is not None}
-    sampling = {"schedule": arguments.schedule, "num_steps": arguments.steps}
-    sampling |= {"uncertainty": arguments.uncertainty, "guidance_scale": arguments.guidance}
-    sampling = {key: value for key, value in sampling.items() if value is not None}
-    if arguments.quick and (asked or arguments.table or arguments.data):
-        named = [f"--{key.replace('_', '-')}" for key in asked] + ["--table"] * arguments.table
-        named += ["--data"] * bool(arguments.data)
-        raise ValueError(f"--quick is a protocol of its own, with one flat list of numbers: leave out {named[0]}")
-    if arguments.limit is not None and arguments.limit < 1:
-        raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
-    _one_thread()
-    from minicmdm.data.folders import load_dataset
-    from minicmdm.evaluation import protocols
-    from minicmdm.evaluation.evaluators import load_bench
-    from minicmdm.evaluation.quick import evaluate_quick
-    from minicmdm.pipeline import MotionPipeline
-
-    if arguments.quick:
-        pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
-        result = evaluate_quick(pipe, progress=True, limit=arguments.limit, **sampling)
-        rows = [f"{k:36s} {v:.4g}" if isinstance(v, float) else f"{k:36s} {v}" for k, v in result.items()]
-        text = "\n".join(rows)
-    else:
-        protocols.check(limit=arguments.limit, **asked)
-        pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
-        asked |= {"checkpoint": arguments.checkpoint, "limit": arguments.limit}
-        if arguments.data is not None:
-            asked |= {"data": load_dataset(arguments.data, "test")}
-            asked |= {"bench": load_bench(Path(arguments.checkpoint) / "evaluator")}
-        result = protocols.evaluate(pipe, progress=True, **asked, **sampling)
-        text = protocols.table(result)
-    if out is not None:
-        write_text(out, (json.dumps(result, indent=2) if out.suffix == ".json" else text) + "\n")
-    encoding = getattr(sys.stdout, "encoding", None) or "ascii"  # a terminal without arrows gets question marks
-    print(json.dumps(result) if arguments.json else text.encode(encoding, "replace").decode(encoding))
-    if out is not None:
-        say(f"wrote {out}")
-
-
-def bench(arguments: argparse.Namespace) -> None:
-    """`minicmdm bench`: what the stream saves, as one JSON object (a dot in a name is a level of it) or as a list."""
-    from minicmdm.files import check_output, write_text
-
-    out = None if arguments.out is None else check_output(arguments.out, (".json", ".txt"), arguments.force)
-    _one_thread()
-    from minicmdm.evaluation import bench as benchmark
-
-    result = benchmark.bench(benchmark.QUICK if arguments.quick else benchmark.FULL, say)
-    levels: dict = {}
-    for name, value in result.items():
-        group, _, leaf = name.rpartition(".")
-        (levels.setdefault(group, {}) if group else levels)[leaf] = value
-    short = json.loads(json.dumps(result), parse_float=lambda number: float(f"{float(number):.4g}"))
-    text = "\n".join(f"{name:28s} {value}" for name, value in short.items())
-    if out is not None:
-        write_text(out, (json.dumps(levels, indent=2) if out.suffix == ".json" else text) + "\n")
-    print(json.dumps(levels) if arguments.json else text)
-    if out is not None:
-        say(f"wrote {out}")

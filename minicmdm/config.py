@@ -7,6 +7,8 @@ A configuration is plain data. It holds no tensor and knows no module, so a chec
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, field, fields, replace
 
+SYSTEMS = ("cmdm", "flood", "mardm", "cdamd")
+
 
 @dataclass(frozen=True)
 class VAEConfig:
@@ -19,6 +21,7 @@ class VAEConfig:
     depth: int = 3  # blocks per residual stack, with dilations growth**(depth-1), ..., growth, 1
     dilation_growth: int = 3
     causal: bool = True  # False: the plain VAE of the ablation, which also looks ahead
+    deterministic: bool = False  # True: the autoencoder of MARDM and CDAMD, whose latents have no noise
 
     @property
     def frames_per_latent(self) -> int:
@@ -68,11 +71,27 @@ class DiTConfig:
     attention: str = "causal"  # or "bidirectional", or "window"
     path: str = "flow"  # it predicts the velocity, as released; "ddpm": the noise at 1,000 levels, as CMDM Eqs 7-10 say
     text_layers: int = 0  # self-attention among the words of a sentence before latents see them (ours)
+    target: str = "v"  # what it predicts on the flow path: "v", "x0" or "eps" (FloodDiffusion's table compares them)
     clock: bool = False  # True (ours): each latent knows how far into its sentence it is, and what is left if known
 
     @property
     def feedforward_dim(self) -> int:
         return 2 * self.dim
+
+
+@dataclass(frozen=True)
+class MaskedConfig:
+    """What MARDM and CDAMD have besides a transformer: a diffusion head, and how much is unmasked at a time."""
+
+    head_dim: int = 1792
+    head_layers: int = 16
+    repeats: int = 4  # noises drawn for every masked latent of a batch: the head is cheap, the transformer is not
+    iterations: int = 18  # of unmasking; CDAMD takes 10
+    # CDAMD only
+    mask: str = "meant"  # the reading of its dual-constrained mask, see systems/cdamd.py
+    codes: int = 512  # of each level of the residual quantiser
+    code_levels: int = 4  # the paper's; the released default is 6
+    prior_drop: float = 0.7  # how often training hides the motion tokens, which sampling never has
 
 
 @dataclass(frozen=True)
@@ -108,7 +127,9 @@ class TrainConfig:
     dit_lr: float = 2e-4
     dit_warmup: int = 2_000
     dit_muon: float = 0.0  # Muon's learning rate for the blocks' matrices (ours); 0: AdamW for all, as the release
-    levels: str = "random"  # of the latents: independent (CMDM Alg. 1), or "staircase", as FSS will present them
+    levels: str = "random"  # of the latents: independent (CMDM Alg. 1), "staircase", as FSS will present them, or
+    # "triangle", FloodDiffusion's staircase of one height
+    overlap: int = 5  # n_s, the latents of that triangle
     time_power: float = 1.0  # random times are u ** time_power: 1 is the paper's, more draws noisy latents more often
     ema: float = 0.9999
     text_drop: float = 0.1  # how often a sample's sentence is replaced by "", the null of guidance
@@ -124,13 +145,17 @@ class Preset:
     """A whole system: what is built and how it is trained."""
 
     name: str
+    system: str = "cmdm"
     vae: VAEConfig = field(default_factory=VAEConfig)
     text: TextConfig = field(default_factory=TextConfig)
     tmr: TMRConfig = field(default_factory=TMRConfig)
     dit: DiTConfig = field(default_factory=DiTConfig)
+    masked: MaskedConfig = field(default_factory=MaskedConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
     def __post_init__(self):
+        if self.system not in SYSTEMS:
+            raise ValueError(f"unknown system {self.system!r}: expected one of {', '.join(SYSTEMS)}")
         if self.vae.latent_dim != self.dit.latent_dim:
             raise ValueError(
                 f"preset {self.name!r}: the VAE writes {self.vae.latent_dim} channels per latent "
@@ -157,11 +182,12 @@ class Preset:
         """
         parts = {"vae": VAEConfig, "text": TextConfig, "tmr": TMRConfig, "dit": DiTConfig, "train": TrainConfig}
         _check_keys(cls, data, "preset", needed={"name", *parts})
+        parts |= {"masked": MaskedConfig} if "masked" in data else {}
         for key, part in parts.items():
             _check_keys(part, data[key], key)
         made = {key: part(**data[key]) for key, part in parts.items()}
         train = replace(made["train"], betas=tuple(made["train"].betas))  # JSON has lists only
-        return cls(**{"name": data["name"], **made, "train": train})
+        return cls(data["name"], data.get("system", "cmdm"), **{**made, "train": train})
 
 
 def _check_keys(cls, data, where: str, needed: Collection[str] = ()):
@@ -246,8 +272,25 @@ PRESETS = {
 }
 
 
-def preset(name: str) -> Preset:
-    """The preset of that name. ValueError: an unknown name, with the known ones."""
-    if name not in PRESETS:
-        raise ValueError(f"unknown preset {name!r}: expected one of {', '.join(PRESETS)}")
-    return PRESETS[name]
+def preset(name: str, system: str = "cmdm") -> Preset:
+    """The preset of that name, as one of the four systems has it: what differs between them, and nothing else.
+
+    Sizes, steps, text encoder and clock are the same for all. ValueError: an unknown name, with the known ones.
+    """
+    for what, value, known in (("preset", name, PRESETS), ("system", system, SYSTEMS)):
+        if value not in known:
+            raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
+    plan = replace(PRESETS[name], system=system)
+    if system == "cmdm":
+        return plan
+    plan = replace(plan, dit=replace(plan.dit, attention="bidirectional"))
+    if system == "flood":
+        return replace(plan, train=replace(plan.train, levels="triangle"))
+    # An autoencoder that looks both ways. No alignment, and for coordinates no root columns that count again.
+    vae = replace(plan.vae, input_dim=67 if system == "mardm" else 66, causal=False, deterministic=True)
+    root = plan.train.root_weight if system == "mardm" else 0.0
+    train = replace(plan.train, align_weight=0.0, kl_weight=0.0, root_weight=root)
+    masked = MaskedConfig(iterations=18 if system == "mardm" else 10)
+    if name in ("toy", "micro"):
+        masked = replace(masked, head_dim=2 * plan.dit.dim, head_layers=3, codes=128)
+    return replace(plan, vae=vae, train=train, masked=masked)

@@ -11,7 +11,6 @@ of the same prompt and seed begins like the shorter one, unless the model is tol
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,21 +19,23 @@ import torch
 from torch import Tensor
 
 import minicmdm
+from minicmdm import asking
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.skeleton import Skeleton, skeleton_of
-from minicmdm.diffusion.sampling import SOLVERS, Denoise, from_noise_prediction, guided, sample
+from minicmdm.diffusion.sampling import Denoise, from_noise_prediction, guided, sample
 from minicmdm.diffusion.schedules import schedule_matrix
 from minicmdm.diffusion.streaming import LatentStream
+from minicmdm.editing import kept
 from minicmdm.live import USUAL, MotionStream, latents_before
 from minicmdm.models.layers import States
 from minicmdm.models.text import Words
 from minicmdm.motion import Motion
+from minicmdm.systems import MASKED
+from minicmdm.systems.flood import to_velocity
 from minicmdm.training import checkpoints
 
-MIN_FRAMES, MAX_FRAMES = 4, 196  # one latent, and the longest motion of HumanML3D (9.8 s)
-MAX_STEPS = 1000
-MAX_GUIDANCE = 100.0
 TOGETHER = 64  # how many motions are sampled in one batch
+SHIPPED = ("toy", "flood", "mardm", "cdamd")
 ASSETS = Path(minicmdm.__file__).parent / "assets"
 
 
@@ -51,21 +52,30 @@ class MotionPipeline:
 
     @classmethod
     def from_pretrained(cls, name: str | Path = "toy") -> MotionPipeline:
-        """Load the shipped checkpoint by its name, "toy", or any checkpoint by its folder.
+        """Load a shipped checkpoint by its name ("toy", or another system's), or any checkpoint by its folder.
 
         Raises FileNotFoundError or ValueError where there is none, or one that is cut short, changed or foreign.
         """
         if not str(name).strip():
             raise ValueError('the checkpoint name is empty: give "toy" or a folder made by `minicmdm train --out`')
         folder = Path(name)
-        if str(name) == "toy" and not (folder / "card.json").is_file():
-            folder = ASSETS / "toy"
-        return cls(checkpoints.load_checkpoint(folder))
+        if str(name) in SHIPPED and not (folder / "card.json").is_file():
+            folder = ASSETS / str(name)
+        checkpoint = checkpoints.load_checkpoint(folder)
+        if checkpoint.preset.system in MASKED:
+            from minicmdm.systems.masked import MaskedPipeline  # which is a pipeline
+
+            return MaskedPipeline(checkpoint)
+        return cls(checkpoint)
 
     @property
     def skeleton(self) -> Skeleton:
         """The body that its training data had, with its frame rate."""
         return skeleton_of(self.preset.vae.input_dim)
+
+    def sampling(self, schedule: str | None, num_steps: int | None, uncertainty: int | None) -> dict[str, str | int]:
+        """The schedule, K and L of this system, but for what is given: for `pipe(...)`, `pipe.stream(...)`."""
+        return asking.usual_sampling(self.preset.system, schedule, num_steps, uncertainty)
 
     def save_pretrained(self, folder: str | Path) -> Path:
         """Write the checkpoint (weights, text encoder, statistics, card) into a folder, made if missing."""
@@ -83,9 +93,9 @@ class MotionPipeline:
         prompt: str | Sequence[str],
         num_frames: int | Sequence[int] = 120,
         *,
-        schedule: str = "fss",
-        num_steps: int = 20,
-        uncertainty: int = 2,
+        schedule: str | None = None,
+        num_steps: int | None = None,
+        uncertainty: int | None = None,
         guidance_scale: float = 3.0,
         solver: str | None = None,
         block_size: int | None = None,
@@ -102,50 +112,96 @@ class MotionPipeline:
         Raises ValueError for anything that cannot be asked.
         """
         single = isinstance(prompt, str)
-        prompts = [prompt] if single else _as_list(prompt, "prompt", "a string or a list of strings")
+        prompts = [prompt] if single else asking.as_list(prompt, "prompt", "a string or a list of strings")
         for text in prompts:
             self._check_prompt(text)
-        frames = [_check_frames(n) for n in _spread(num_frames, len(prompts), "num_frames")]
-        seeds = [_integer(s, "seed", 0, 2**63 - 1) for s in _spread(seed, len(prompts), "seed")]
-        num_steps = _integer(num_steps, "num_steps", 1, MAX_STEPS)
-        scale = _check_guidance(guidance_scale)
-        block_size = self.preset.dit.block_size if block_size is None else _integer(block_size, "block_size", 1, 49)
-        schedule_matrix(1, num_steps, uncertainty, block_size, schedule)  # refuse a bad schedule before any work
-        solver = solver or {"flow": "euler", "ddpm": "ddpm"}[self.preset.dit.path]
-        if solver not in SOLVERS:
-            raise ValueError(f"unknown solver {solver!r}: expected one of {', '.join(SOLVERS)}")
-
+        frames = [asking.check_frames(n) for n in asking.spread(num_frames, len(prompts), "num_frames")]
+        seeds = [asking.integer(s, "seed", 0, 2**63 - 1) for s in asking.spread(seed, len(prompts), "seed")]
+        ask = self._asked(schedule, num_steps, uncertainty, block_size, guidance_scale, solver, tell_length)
         motions: dict[int, Motion] = {}
         order = sorted(range(len(prompts)), key=lambda i: frames[i])
         for first in range(0, len(order), TOGETHER):
             chosen = order[first : first + TOGETHER]
             counts = [-(-frames[i] // 4) for i in chosen]  # latents: frames / 4, rounded up
             luck = [torch.Generator().manual_seed(seeds[i]) for i in chosen]
-            asked = [prompts[i] for i in chosen]
-            if solver == "euler" and schedule != "trapezoid" and self.preset.dit.attention == "causal":
-                how = dict(schedule=schedule, num_steps=num_steps, uncertainty=uncertainty, block_size=block_size)
-                how |= dict(guidance_scale=scale, num_latents=max(counts), lasts=counts if tell_length else 0)
-                # The same numbers for less work. It knows no padding, but causal latents do not see what comes later.
-                latents = LatentStream(self.dit, self._read, self._read([""]), asked, luck, **how).drain()
-            else:
-                noise = torch.stack([self._noise(generator, max(counts)) for generator in luck])  # (B,N,C)
-                valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]  # (B,N)
-                matrix = schedule_matrix(max(counts), num_steps, uncertainty, block_size, schedule)
-                denoise = self._denoiser(asked, valid, scale, tell_length)
-                latents = sample(denoise, matrix, noise, solver=solver, path=self.preset.dit.path, generator=luck)
+            latents = self._latents([prompts[i] for i in chosen], counts, luck, ask)
             for i, count, one in zip(chosen, counts, latents):  # a VAE that looks ahead must not see padding
-                features = self.decode(one[None, :count])[0, : frames[i]].numpy()  # (T,D)
-                joints = features_to_joints(features).astype(np.float32)  # (T,22,3)
-                motions[i] = Motion(joints, features, prompts[i], self.skeleton.fps)
+                motions[i] = self._motion(one[:count], frames[i], prompts[i])
         return motions[0] if single else [motions[i] for i in range(len(prompts))]
+
+    def _asked(
+        self, schedule, num_steps, uncertainty, block_size, guidance_scale, solver, tell_length=True
+    ) -> asking.Asked:
+        plan = self.sampling(schedule, num_steps, uncertainty)
+        solver = solver or {"flow": "euler", "ddpm": "ddpm"}[self.preset.dit.path]
+        block_size = self.preset.dit.block_size if block_size is None else block_size
+        return asking.check_sampling(*plan.values(), block_size, guidance_scale, solver, tell_length)
+
+    @torch.no_grad()
+    def _latents(
+        self,
+        prompts: list[str],
+        counts: list[int],
+        luck: list[torch.Generator],
+        ask: asking.Asked,
+        prefix: Tensor | None = None,
+    ) -> Tensor:
+        """Sampled latents (B,N,C), N the greatest of `counts`, of which the first (B,P,C) may be given."""
+        plan = dict(schedule=ask.schedule, num_steps=ask.num_steps, uncertainty=ask.uncertainty)
+        plain = ask.solver == "euler" and ask.schedule != "trapezoid" and prefix is None
+        if plain and self.preset.dit.attention == "causal" and self.preset.dit.target == "v":
+            how = dict(block_size=ask.block_size, guidance_scale=ask.guidance_scale)
+            how |= dict(num_latents=max(counts), lasts=counts if ask.tell_length else 0)
+            # The same numbers for less work. It knows no padding, but causal latents do not see what comes later.
+            return LatentStream(self.dit, self._read, self._read([""]), prompts, luck, **plan, **how).drain()
+        given = 0 if prefix is None else prefix.shape[1]
+        noise = torch.stack([self._noise(generator, max(counts)) for generator in luck])[:, given:]  # (B,N-P,C)
+        valid = torch.arange(max(counts)) < torch.tensor(counts)[:, None]  # (B,N)
+        matrix = schedule_matrix(max(counts) - given, ask.num_steps, ask.uncertainty, ask.block_size, ask.schedule)
+        denoise = self._denoiser(prompts, valid, ask.guidance_scale, ask.tell_length)
+        how = dict(solver=ask.solver, path=self.preset.dit.path, generator=luck)
+        return sample(denoise, matrix, noise, prefix, **how)
+
+    def _motion(self, latents: Tensor, frames: int, caption: str) -> Motion:
+        features = self.decode(latents[None])[0, :frames].numpy()  # (T,D)
+        return Motion(features_to_joints(features).astype(np.float32), features, caption, self.skeleton.fps)
+
+    def edit(
+        self,
+        motion: Motion,
+        given: str = "first_half",
+        prompt: str | None = None,
+        *,
+        guidance_scale: float = 3.0,
+        seed: int = 0,
+    ) -> Motion:
+        """Make a part of a motion anew, for a prompt or its own caption, and keep what is `given` of it.
+
+        MARDM and CDAMD keep "first_half", "second_half", "ends" or "middle"; a model that starts at the beginning can
+        go on from the "first_half" alone. Kept parts are encoded by themselves and come back as the autoencoder has
+        them. Raises ValueError for anything that cannot be asked.
+        """
+        prompt = motion.caption if prompt is None else prompt
+        self._check_prompt(prompt)
+        ask = self._asked(None, None, None, None, guidance_scale, None)
+        generator = torch.Generator().manual_seed(asking.integer(seed, "seed", 0, 2**63 - 1))
+        z, keep = kept(self.encode, motion, given)  # (1,N,C), (N,)
+        return self._motion(self._fill(z, keep, prompt, generator, ask)[0], len(motion), prompt)
+
+    def _fill(self, z: Tensor, keep: Tensor, prompt: str, generator: torch.Generator, ask: asking.Asked) -> Tensor:
+        """The latents z (1,N,C) that are not to be kept, sampled. (1,N,C)"""
+        given = int(keep.sum())
+        if not keep[:given].all():
+            raise ValueError('this model works from the beginning on: it can keep the "first_half", the others not')
+        return self._latents([prompt], [len(keep)], [generator], ask, z[:, :given])
 
     def stream(
         self,
         prompt: str | Sequence[str],
         *,
-        schedule: str = "fss",
-        num_steps: int = 20,
-        uncertainty: int = 2,
+        schedule: str | None = None,
+        num_steps: int | None = None,
+        uncertainty: int | None = None,
         guidance_scale: float = 3.0,
         seed: int | Sequence[int] = 0,
         block_size: int | None = None,
@@ -162,15 +218,14 @@ class MotionPipeline:
         the "new" latents only, or by the "active" ones in flight too. `num_frames` gives the stream an end after all.
         Raises ValueError for anything that cannot be asked.
         """
-        if self.preset.dit.path != "flow":
-            raise ValueError(
-                "this model predicts noise, and the stream steps along a velocity: generate motions instead"
-            )
+        if self.preset.dit.path != "flow" or self.preset.dit.target != "v":
+            raise ValueError("this model predicts no velocity, along which a stream steps: generate motions instead")
         single = isinstance(prompt, str)
-        prompts = [prompt] if single else _as_list(prompt, "prompt", "a string or a list of strings")
-        seeds = [_integer(s, "seed", 0, 2**63 - 1) for s in _spread(seed, len(prompts), "seed")]
-        num_frames = num_frames if num_frames is None else _integer(num_frames, "num_frames", 1, 2**31)
-        lasts = lasts if lasts is None else _integer(lasts, "lasts", 1, 2**31)
+        prompts = [prompt] if single else asking.as_list(prompt, "prompt", "a string or a list of strings")
+        seeds = [asking.integer(s, "seed", 0, 2**63 - 1) for s in asking.spread(seed, len(prompts), "seed")]
+        plan = self.sampling(schedule, num_steps, uncertainty)
+        num_frames = num_frames if num_frames is None else asking.integer(num_frames, "num_frames", 1, 2**31)
+        lasts = lasts if lasts is None else asking.integer(lasts, "lasts", 1, 2**31)
 
         def read(sentences: list[str]) -> Words:
             for sentence in sentences:
@@ -185,12 +240,14 @@ class MotionPipeline:
             self._read([""]),
             prompts,
             [torch.Generator().manual_seed(s) for s in seeds],
-            schedule=schedule,
-            num_steps=_integer(num_steps, "num_steps", 1, MAX_STEPS),
-            uncertainty=uncertainty,
-            block_size=self.preset.dit.block_size if block_size is None else _integer(block_size, "block_size", 1, 49),
-            guidance_scale=_check_guidance(guidance_scale),
-            window=window if window is None else _integer(window, "window", 1, 2**20),
+            schedule=plan["schedule"],
+            num_steps=asking.integer(plan["num_steps"], "num_steps", 1, asking.MAX_STEPS),
+            uncertainty=plan["uncertainty"],
+            block_size=self.preset.dit.block_size
+            if block_size is None
+            else asking.integer(block_size, "block_size", 1, 49),
+            guidance_scale=asking.check_guidance(guidance_scale),
+            window=window if window is None else asking.integer(window, "window", 1, 2**20),
             new_prompt=new_prompt,
             num_latents=None if num_frames is None else -(-num_frames // 4),
             lasts=0 if lasts is None else max(1, latents_before(lasts)),
@@ -209,7 +266,10 @@ class MotionPipeline:
         left = valid.sum(1, keepdim=True) - 1 - place if tell_length else torch.full_like(place, -1.0)
         clock = torch.stack([place, left], dim=-1)  # (B,N,2): all is one sentence
         denoise = guided(self.dit, words.embeddings, mask, null_words, null_mask, scale, valid, clock)
-        return from_noise_prediction(denoise) if self.preset.dit.path == "ddpm" else denoise
+        if self.preset.dit.path == "ddpm":
+            return from_noise_prediction(denoise)
+        target = self.preset.dit.target
+        return denoise if target == "v" else lambda z_t, t: to_velocity(denoise(z_t, t), target, z_t, t)
 
     @torch.no_grad()
     def _read(self, sentences: list[str]) -> Words:
@@ -233,59 +293,8 @@ class MotionPipeline:
         return self.decode(self.encode(features[None, :whole]))[0].numpy()
 
     def _noise(self, generator: torch.Generator, num_latents: int) -> Tensor:
-        longest = -(-MAX_FRAMES // 4)
+        longest = -(-asking.MAX_FRAMES // 4)
         return torch.randn(longest, self.preset.dit.latent_dim, generator=generator)[:num_latents]
 
     def _check_prompt(self, prompt: object) -> None:
-        if not isinstance(prompt, str):
-            raise ValueError(f"a prompt must be a string, like 'a person walks', and {type(prompt).__name__} came")
-        if not prompt.strip():
-            raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
-        try:
-            prompt.encode("utf-8")
-        except UnicodeEncodeError as error:
-            raise ValueError("the prompt holds bytes that are no text in this locale's encoding") from error
-        encoding = self.text.tokenizer.encode(prompt)
-        if encoding.overflowing:
-            total = len(encoding.ids) + sum(len(rest.ids) for rest in encoding.overflowing)
-            raise ValueError(
-                f"the prompt is too long: about {total} word pieces, and the longest is {len(encoding.ids)}"
-            )
-
-
-def _as_list(value: object, name: str, expected: str) -> list:
-    if not isinstance(value, (list, tuple)) or not value:
-        what = "an empty list" if isinstance(value, (list, tuple)) else type(value).__name__
-        raise ValueError(f"{name} must be {expected}, and {what} came")
-    return list(value)
-
-
-def _spread(value: object, count: int, name: str) -> list:
-    """One value for all prompts, or a list with one for each."""
-    if not isinstance(value, (list, tuple, np.ndarray)):
-        return [value] * count
-    if len(value) != count:
-        raise ValueError(f"{name}: {count} prompts need one value or {count}, and {len(value)} came")
-    return list(value)
-
-
-def _integer(value: object, name: str, low: int, high: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not low <= value <= high:
-        raise ValueError(f"{name} must be a whole number from {low} to {high}, and {value!r} came")
-    return int(value)
-
-
-def _check_frames(value: object) -> int:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not MIN_FRAMES <= value <= MAX_FRAMES:
-        raise ValueError(
-            f"num_frames must be a whole number from {MIN_FRAMES} (0.2 s) to {MAX_FRAMES} (9.8 s, the longest), "
-            f"and {value!r} came"
-        )
-    return int(value)
-
-
-def _check_guidance(value: object) -> float:
-    number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    if not number or not math.isfinite(value) or not 0 <= value <= MAX_GUIDANCE:
-        raise ValueError(f"guidance_scale must be a number from 0 to {MAX_GUIDANCE:.0f} (1 is off), and {value!r} came")
-    return float(value)
+        asking.check_prompt(prompt, self.text.tokenizer)

@@ -100,14 +100,18 @@ def features_to_joints(features: np.ndarray) -> np.ndarray:
     """Joint positions (..., T, 22, 3), in metres, of features (..., T, 263): frame 0 at the floor's origin, facing +Z.
 
     KIT-ML's (..., T, 251) are (..., T, 21, 3). It reads only the first 67 numbers (64), so essential features do as
-    well. ValueError for another width or for numbers that are not finite.
+    well; coordinates (..., T, 66) are joints already. ValueError for another width or for numbers that are not finite.
     """
     features = np.asarray(features)
-    widths = [width for body in SKELETONS for width in (body.num_features, body.num_essential)]
+    widths = [n for body in SKELETONS for n in (body.num_features, body.num_essential, 3 * body.num_joints)]
     if features.ndim < 2 or features.shape[-1] not in widths or features.shape[-2] < 1:
-        told = "(..., T, 263) or (..., T, 67), of KIT-ML 251 or 64, with T >= 1"
+        told = "(..., T, 263), (..., T, 67) or (..., T, 66), of KIT-ML 251, 64 or 63, with T >= 1"
         raise ValueError(f"features must be {told}, got {features.shape}")
     body = skeleton_of(features.shape[-1])
+    if features.shape[-1] == 3 * body.num_joints:
+        if not np.isfinite(features).all():
+            raise ValueError("coordinates hold NaN or infinite numbers; a motion must be finite in every frame")
+        return features.reshape(*features.shape[:-1], body.num_joints, 3)
     dtype = np.float32 if features.dtype == np.float32 else np.float64
     essential = features[..., : body.num_essential].astype(np.float64)
     if not np.isfinite(essential).all():
@@ -123,6 +127,12 @@ def features_to_joints(features: np.ndarray) -> np.ndarray:
     joints[..., 0, 1] = essential[..., 3]
     joints[..., 1:, :] = essential[..., 4:].reshape(*yaw.shape, body.num_joints - 1, 3)
     return ((turn(joints, yaw) + root[..., None, :]) * body.unit).astype(dtype)
+
+
+def features_of(joints: np.ndarray) -> np.ndarray:
+    """Features (T, 263) of all T frames of joints (T, 22, 3), the last step taken twice: a step needs a next frame."""
+    step = joints[-1:] - joints[-2:-1]  # nothing if there is one frame
+    return joints_to_features(np.concatenate([joints, joints[-1:] + (step if len(step) else 0)]))
 
 
 def essential(features: np.ndarray) -> np.ndarray:

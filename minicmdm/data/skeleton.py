@@ -148,12 +148,14 @@ SKELETONS = (SMPL22, KIT21)
 
 
 def skeleton_of(size: int) -> Skeleton:
-    """The body with so many joints (22, 21), features (263, 251) or essential features (67, 64). ValueError: no body's.
+    """The body with so many joints (22, 21), features (263, 251), essential ones (67, 64) or coordinates (66, 63).
+
+    ValueError: no body's.
 
     No two of these numbers are the same, so an array's own shape says whose it is.
     """
     for body in SKELETONS:
-        if size in (body.num_joints, body.num_features, body.num_essential):
+        if size in (body.num_joints, body.num_features, body.num_essential, 3 * body.num_joints):
             return body
     raise ValueError(
         f"expected 263 features or 22 joints (HumanML3D), or 251 features or 21 joints (KIT-ML), and {size} came"

@@ -82,6 +82,7 @@ def diffusion_forcing_loss(
     generator: torch.Generator | None = None,
     clock: Tensor | None = None,
     path: str = "flow",
+    target: str = "v",
     committed: Tensor | None = None,
     t: Tensor | None = None,
 ) -> Tensor:
@@ -90,8 +91,8 @@ def diffusion_forcing_loss(
     z (B,N,C) are normalised clean latents; words (B,S,E), word_mask (B,N,S), valid (B,N) and clock (B,N,2) go to
     `model` as they are. Text drop is the caller's: it replaces a sample's sentence by "" before encoding, which
     keeps the words, the per-latent mask and the null branch of guidance one and the same thing.
-    path: "flow" asks for the velocity at t, as the release does; "ddpm" for the noise at integer levels k of 0..1000,
-    as the paper writes, and tells the model 1 - k/1000.
+    path: "flow" asks for the velocity at t, as the release does (or, by `target`, for x0 or eps); "ddpm" for the noise
+    at integer levels k of 0..1000, as the paper writes, and tells the model 1 - k/1000.
     committed (B,N): latents that are finished (`draw_boundary`, `draw_staircase`). They are given clean, the model
     hears of them, and they do not count. t (B,N): the times, drawn independently unless given.
     """
@@ -104,17 +105,17 @@ def diffusion_forcing_loss(
         t = t.masked_fill(committed, 1.0)
         asked, more = ~committed if valid is None else valid & ~committed, {"committed": committed}
     if path == "flow":
-        noisy, target = interpolate(z, eps, t), velocity(z, eps)
+        noisy, wanted = interpolate(z, eps, t), {"v": velocity(z, eps), "x0": z, "eps": eps}[target]
     elif path == "ddpm":
         level = ((1 - t) * (DDPM_LEVELS + 1)).ceil() - 1  # uniform on 0..K for t uniform on [0,1); 1 - k/K is t again
         level = level.clamp_min(0)  # the finished ones, t = 1
         t = 1 - level / DDPM_LEVELS
         alpha_bar = cosine_alpha_bar(level / DDPM_LEVELS).unsqueeze(-1)  # (B,N,1)
-        noisy, target = alpha_bar.sqrt() * z + (1 - alpha_bar).sqrt() * eps, eps
+        noisy, wanted = alpha_bar.sqrt() * z + (1 - alpha_bar).sqrt() * eps, eps
     else:
         raise ValueError(f"unknown path {path!r}: expected 'flow' or 'ddpm'")
     predicted = model(noisy, t, words, word_mask, valid, clock, **more)
-    error = (predicted - target).square().mean(-1)  # (B,N,C) -> (B,N)
+    error = (predicted - wanted).square().mean(-1)  # (B,N,C) -> (B,N)
     if asked is None:
         return error.mean()
     # `where` rather than a product: whatever stands in the padding, even NaN, stays out.

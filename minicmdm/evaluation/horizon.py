@@ -68,9 +68,9 @@ def timelines(
     protocol: str = "long",
     *,
     evaluator: str = JUDGE,
-    schedule: str = "fss",
-    num_steps: int = 20,
-    uncertainty: int = 2,
+    schedule: str | None = None,
+    num_steps: int | None = None,
+    uncertainty: int | None = None,
     guidance_scale: float = 3.0,
     compositions: int | None = None,
     prompts_each: int | None = None,
@@ -85,7 +85,7 @@ def timelines(
     """
     check(protocol, evaluator, repeats, limit, compositions, prompts_each)
     count, each = (own or usual for own, usual in zip((compositions, prompts_each), HORIZONS[protocol]))
-    ask = dict(schedule=schedule, num_steps=num_steps, uncertainty=uncertainty, guidance_scale=guidance_scale)
+    ask = {**pipe.sampling(schedule, num_steps, uncertainty), "guidance_scale": guidance_scale}
     pipe.stream(["a person stands"], num_frames=4, **ask)  # what the pipeline refuses, it refuses here
     clips = toy_dataset("test", limit, progress).clips
     source = [(segment, said) for clip in clips for segment, (_, _, said) in zip(clip.program, clip.labels)]

@@ -123,9 +123,9 @@ def text_to_motion(
     *,
     data: MotionDataset | None = None,
     evaluator: str = JUDGE,
-    schedule: str = "fss",
-    num_steps: int = 20,
-    uncertainty: int = 2,
+    schedule: str | None = None,
+    num_steps: int | None = None,
+    uncertainty: int | None = None,
     guidance_scale: float = 3.0,
     solver: str | None = None,
     repeats: int = 5,
@@ -139,7 +139,7 @@ def text_to_motion(
     and so no `gt`, and the floor's motions differ in length too. Source: Guo et al. 2022; MARDM's evaluation.
     """
     check("t2m", evaluator, repeats, limit)
-    ask = dict(schedule=schedule, num_steps=num_steps, uncertainty=uncertainty, guidance_scale=guidance_scale)
+    ask = {**pipe.sampling(schedule, num_steps, uncertainty), "guidance_scale": guidance_scale}
     ask |= {} if solver is None else {"solver": solver}
     pipe(["a person stands"], [4], seed=[0], **ask)  # what the pipeline refuses, it refuses here and not in a minute
     clips, told, fingerprint = _test_set(data, limit, progress)

@@ -31,9 +31,9 @@ def evaluate_quick(
     progress: bool = True,
     limit: int | None = None,
     *,
-    schedule: str = "fss",
-    num_steps: int = 20,
-    uncertainty: int = 2,
+    schedule: str | None = None,
+    num_steps: int | None = None,
+    uncertainty: int | None = None,
     guidance_scale: float = 3.0,
 ) -> dict[str, float | int | str]:
     """Judge a pipeline on the first `limit` test prompts (default: all 1,024): shares of right segments, 0 to 1.
@@ -43,7 +43,7 @@ def evaluate_quick(
     `_gt` is the truth's own score, `_nearest` the baseline's whole clips on ordinary prompts; `mpjpe_mm` the VAE's
     reconstruction error, pelvis-aligned. Progress goes to stderr.
     """
-    start = time.perf_counter()
+    start, plan = time.perf_counter(), pipe.sampling(schedule, num_steps, uncertainty)
     clips = toy_dataset("test", limit, progress).clips
     asked = [clip.program for clip in clips]
     truth = [_read(features_to_joints(clip.features)) for clip in clips]
@@ -56,9 +56,7 @@ def evaluate_quick(
             motions = pipe(
                 [prompts[i] for i in chunk],
                 [len(clips[i].features) for i in chunk],
-                schedule=schedule,
-                num_steps=num_steps,
-                uncertainty=uncertainty,
+                **plan,
                 guidance_scale=guidance_scale,
                 seed=[1000 + i for i in chunk],
             )
@@ -104,9 +102,7 @@ def evaluate_quick(
         **{key: round(value, 4) for key, value in numbers.items()},
         "prompts": len(clips),
         "prompts_shuffled": len(some),
-        "schedule": schedule,
-        "num_steps": num_steps,
-        "uncertainty": uncertainty,
+        **plan,
         "guidance_scale": guidance_scale,
         "fingerprint": world_fingerprint(),
         "seconds": round(time.perf_counter() - start, 1),

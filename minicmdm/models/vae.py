@@ -77,6 +77,8 @@ class MACVAE(nn.Module):
             )
         hidden = _in_pieces(self.encoder, x.transpose(1, 2), states).transpose(1, 2)  # (B,T,D) -> (B,N,width)
         mean, logvar = self.to_gaussian(hidden).chunk(2, dim=-1)  # 2 x (B,N,C)
+        if self.cfg.deterministic:  # an autoencoder: a Gaussian of no width
+            return mean, torch.full_like(logvar, -30.0)
         return mean, logvar.clamp(-30, 20)
 
     def decode(self, z: Tensor, states: States | None = None) -> Tensor:

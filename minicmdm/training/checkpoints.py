@@ -4,7 +4,7 @@ A checkpoint is a folder:
 
     tmr.safetensors     the teacher that aligned it; its text encoder is text/
     vae.safetensors     MAC-VAE (EMA weights)
-    dit.safetensors     CausalDiT (EMA weights)
+    dit.safetensors     CausalDiT, or another system's transformer (EMA weights)
     text/               the text encoder: tokenizer.json, config.json, model.safetensors
     stats.safetensors   mean and std of the features (263,), and of the latents (C,)
     card.json           preset, seed, data fingerprint, metrics, seconds, version, command, and the files' checksums
@@ -18,7 +18,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,11 +28,13 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from minicmdm.config import Preset
+from minicmdm.data.skeleton import skeleton_of
 from minicmdm.files import whole_file, write_text
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder
 from minicmdm.models.tmr import MotionTeacher
 from minicmdm.models.vae import MACVAE
+from minicmdm.systems import MaskedTransformer, new_denoiser
 
 FORMAT = "minicmdm-checkpoint-1"
 WEIGHTS = ("vae.safetensors", "stats.safetensors", "dit.safetensors", "text/model.safetensors")  # what a motion takes
@@ -46,7 +48,7 @@ class Checkpoint:
 
     preset: Preset
     vae: MACVAE
-    dit: CausalDiT
+    dit: CausalDiT | MaskedTransformer
     text: TextEncoder
     stats: dict[str, Tensor]  # feature_mean, feature_std (D,); latent_mean, latent_std (C,)
     card: dict
@@ -123,7 +125,7 @@ def save_teacher(folder: Path, teacher: MotionTeacher) -> None:
         save_text(folder, teacher.text)
 
 
-def save_dit(folder: Path, dit: CausalDiT) -> None:
+def save_dit(folder: Path, dit: nn.Module) -> None:
     """Write the last stage's part: the denoiser."""
     save_tensors(folder / "dit.safetensors", dit.state_dict())
 
@@ -209,7 +211,7 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
         )
     preset = read_preset(card, folder)
     vae, stats = load_vae(folder, preset)
-    dit = _build(CausalDiT, preset.dit, folder)
+    dit = _build(new_denoiser, preset, folder)
     load_weights(dit, folder / "dit.safetensors")
     text = TextEncoder.load(folder / "text", preset.text)
     return Checkpoint(preset, vae, dit.eval(), text.eval(), stats, card)
@@ -234,7 +236,7 @@ def load_teacher(folder: Path, preset: Preset) -> MotionTeacher:
     """Load the teacher in eval mode, with the text encoder it was trained with. It learns no more."""
     text = TextEncoder.load(folder / "text", preset.text)
     try:
-        teacher = MotionTeacher(preset.tmr, text, preset.vae.input_dim)
+        teacher = MotionTeacher(preset.tmr, text, skeleton_of(preset.vae.input_dim).num_features)
     except ValueError as error:
         raise ValueError(f"{folder / 'card.json'} describes a teacher that cannot be built: {error}") from error
     words = {f"text.{key}": value for key, value in text.state_dict().items()}
@@ -242,7 +244,7 @@ def load_teacher(folder: Path, preset: Preset) -> MotionTeacher:
     return teacher.eval().requires_grad_(False)
 
 
-def _build(model: type[nn.Module], config: object, folder: Path) -> nn.Module:
+def _build(model: Callable[..., nn.Module], config: object, folder: Path) -> nn.Module:
     try:
         return model(config)
     except (TypeError, ValueError, ArithmeticError, RuntimeError, MemoryError) as error:

@@ -14,6 +14,9 @@ from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, dr
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder, Words
 from minicmdm.models.wordcache import WordCache
+from minicmdm.systems import MASKED, MaskedTransformer, new_denoiser
+from minicmdm.systems.flood import draw_triangle
+from minicmdm.systems.mardm import masked_loss
 from minicmdm.training import checkpoints
 from minicmdm.training.batches import DenoiserBatch, draw_batch, encode_dataset, said, words_per_latent
 from minicmdm.training.distributed import ALONE, Team
@@ -41,9 +44,12 @@ def train_dit(
     words = WordCache(text, {"", *said(train_set), *said(val_set)}, progress=progress and team.first)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(step_key(cfg.seed, -2))
-        dit = CausalDiT(plan.dit)
+        dit = new_denoiser(plan)
+    if plan.system == "cdamd":
+        dit.quantizer.fit(torch.cat(latents.means), torch.Generator().manual_seed(step_key(cfg.seed, -4)))
     if cfg.compile:  # the elementwise work between the matmuls, more than half of a step, becomes a few loops
-        for block in (*dit.blocks, *dit.word_blocks):
+        transformer = dit.body if plan.system in MASKED else dit
+        for block in (*transformer.blocks, *transformer.word_blocks):
             block.compile(dynamic=True)
     models = nn.ModuleDict({"dit": dit})
 
@@ -76,7 +82,7 @@ def train_dit(
 
 
 def denoising_loss(
-    dit: CausalDiT,
+    dit: CausalDiT | MaskedTransformer,
     words: WordCache,
     batch: DenoiserBatch,
     plan: Preset,
@@ -89,19 +95,25 @@ def denoising_loss(
     the denoiser's.
     """
     block_size, committed, visible = plan.dit.block_size, None, batch.valid
-    if plan.train.levels == "staircase":
+    if plan.system in MASKED:  # no levels: what is masked is drawn with the loss
+        t = torch.zeros(batch.valid.shape)
+    elif plan.train.levels == "staircase":
         t, committed, visible = draw_staircase(batch.valid, block_size, generator)
+    elif plan.train.levels == "triangle":
+        t, committed, visible = draw_triangle(batch.valid, plan.train.overlap, generator)
     else:
         t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
         if plan.dit.attention == "window":
             committed, visible = draw_boundary(batch.valid, block_size, generator)
     said = hide_words(words.encode(batch.sentences), word_drop, generator)  # each sentence once: (U,S1,E)
-    device = dit.out.weight.device
+    device = next(dit.parameters()).device
     batch, said = batch.to(device), Words(said.embeddings.to(device), said.mask.to(device))
     t, visible = t.to(device), visible.to(device)
     committed = None if committed is None else committed.to(device)
     with torch.autocast(device.type, torch.bfloat16, enabled=plan.train.bfloat16):
         seen, mask = words_per_latent(dit.read(said), batch.choice, batch.owner)  # (B,S,E), (B,N,S)
+        if plan.system in MASKED:
+            return masked_loss(dit, batch.z, seen, mask, visible, batch.clock, generator)
         return diffusion_forcing_loss(
             dit,
             batch.z,
@@ -111,6 +123,7 @@ def denoising_loss(
             generator=generator,
             clock=batch.clock,
             path=plan.dit.path,
+            target=plan.dit.target,
             committed=committed,
             t=t,
         )

@@ -19,9 +19,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from minicmdm.config import Preset
 from minicmdm.data.programs import MAX_FRAMES
-from minicmdm.models.dit import CausalDiT
+from minicmdm.data.skeleton import skeleton_of
 from minicmdm.models.tmr import MotionTeacher
 from minicmdm.models.vae import MACVAE, vae_loss
+from minicmdm.systems import new_denoiser
 
 WORDS, LEVELS = 20, 64  # of a sentence; different times in a batch
 PER_WEIGHT = 4 * 5  # bytes: the weight, its gradient, two moments, the slow average
@@ -51,9 +52,11 @@ def estimate(plan: Preset, accumulate: int = 1) -> list[Estimate]:
 
     with FakeTensorMode():
         words_side = SimpleNamespace(cfg=plan.text)  # is not run
-        teacher = MotionTeacher(plan.tmr, words_side, plan.vae.input_dim)
-        vae, dit = MACVAE(plan.vae), CausalDiT(plan.dit)
-        frames = torch.empty(cfg.tmr_batch, MAX_FRAMES, plan.vae.input_dim)
+        teacher_dim = skeleton_of(plan.vae.input_dim).num_features
+        teacher = MotionTeacher(plan.tmr, words_side, teacher_dim)
+        vae, model = MACVAE(plan.vae), new_denoiser(plan)
+        dit = getattr(model, "body", model)  # of MARDM and CDAMD the transformer; they have a head besides
+        frames = torch.empty(cfg.tmr_batch, MAX_FRAMES, teacher_dim)
         crops = torch.empty(cfg.vae_batch, cfg.crop_frames // group * group, plan.vae.input_dim)
         z = torch.empty(cfg.dit_batch, latents, plan.dit.latent_dim)
         words = torch.empty(cfg.dit_batch, WORDS, plan.dit.dim)
@@ -63,12 +66,16 @@ def estimate(plan: Preset, accumulate: int = 1) -> list[Estimate]:
         def velocity() -> Tensor:
             modulations, read = dit.modulations(torch.empty(LEVELS)), dit.keys_values(words)
             mask, places = torch.zeros(latents, latents), torch.arange(latents)  # added to the scores
-            return dit.evaluate(z, which, modulations, read, None, mask, places, told)
+            seen = dit.evaluate(z, which, modulations, read, None, mask, places, told)
+            if dit is model:
+                return seen
+            many = [x.repeat(plan.masked.repeats, 1, 1) for x in (z, seen)]  # at most: all latents masked
+            return model.head(many[0], many[0][..., 0], many[1])
 
         return [
             _measure("tmr", teacher, lambda: teacher.frames(frames), cfg.tmr_steps, accumulate),
             _measure("vae", vae, lambda: vae_loss(vae(crops), crops, cfg).total, cfg.vae_steps, accumulate),
-            _measure("dit", dit, velocity, cfg.dit_steps, accumulate),
+            _measure("dit", model, velocity, cfg.dit_steps, accumulate),
         ]
 
 

@@ -55,7 +55,7 @@ def train_teacher(
         if text.cfg.frozen:
             sentences = {"", *said(train_set), *said(val_set)}  # the denoiser's list: what is kept on disk serves both
             read = WordCache(text.to(team.device), sentences, progress=progress and team.first)
-        models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, read, plan.vae.input_dim)})
+        models = nn.ModuleDict({"tmr": MotionTeacher(plan.tmr, read, len(train_set.mean))})
     if not again and team.first:  # at once, so that a resumed run goes on with the very vocabulary it began with
         checkpoints.save_text(out, text)
 

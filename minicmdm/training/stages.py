@@ -23,6 +23,7 @@ from minicmdm.data.dataset import MotionDataset, cached_toy_folder, toy_dataset
 from minicmdm.data.folders import load_dataset
 from minicmdm.evaluation.evaluators import train_bench
 from minicmdm.models.text import find_encoder, with_encoder
+from minicmdm.systems import seen_by
 from minicmdm.training import checkpoints
 from minicmdm.training.denoiser import train_dit
 from minicmdm.training.distributed import Team
@@ -46,6 +47,7 @@ def train(
     out: str | Path,
     stage: str = "all",
     *,
+    system: str = "cmdm",
     resume: bool = False,
     fast: bool = False,
     data: str | Path | None = None,
@@ -62,13 +64,15 @@ def train(
 ) -> Path:
     """Train a preset (a name, or a Preset of one's own) and leave a checkpoint in the folder `out`, made if missing.
 
+    `system` is one of `config.SYSTEMS`; all go through the same stages.
+
     `data` is a folder in HumanML3D's layout; without it the toy world is synthesised. `fast` is a smoke run of seconds;
     `compile` makes the denoiser's steps shorter, where there is a C++ compiler; `bf16` computes in bfloat16.
     `accumulate`, `device`, `workers`: see distributed.py.
     `text` names a pretrained text encoder ("minilm", a folder, a hub name that is on this machine) that stays frozen.
     Raises ValueError for an unknown preset or stage, FileExistsError where a run is there already and `resume` is off.
     """
-    plan = preset(preset_name) if isinstance(preset_name, str) else preset_name
+    plan = preset(preset_name, system) if isinstance(preset_name, str) else preset_name
     if stage not in STAGES:
         raise ValueError(f"unknown stage {stage!r}: expected one of {', '.join(STAGES)}")
     own = {"seed": plan.train.seed if seed is None else seed, "compile": compile or plan.train.compile}
@@ -101,7 +105,9 @@ def train(
 
     say("reading the data")
     train_set, val_set = _datasets(data, fast, progress)
-    plan = replace(plan, vae=replace(plan.vae, input_dim=len(train_set.mean)))  # 263, or KIT-ML's 251
+    own_train = seen_by(plan.system, train_set)  # what is encoded: features, essential ones, or coordinates
+    own_val = seen_by(plan.system, val_set, own_train)
+    plan = replace(plan, vae=replace(plan.vae, input_dim=len(own_train.mean)))  # 263, or KIT-ML's 251, or fewer
     out.mkdir(parents=True, exist_ok=True)  # not sooner: what is wrong with the data leaves no folder behind
     say(f"{len(train_set.clips)} clips to train on, {len(val_set.clips)} to validate on")
     if progress and not fast:
@@ -117,7 +123,8 @@ def train(
         "fast": fast,
     }
     for name in wanted:
-        result = RUN[name](plan, train_set, val_set, out, resume=resume, progress=progress, team=team)
+        sets = (own_train, own_val) if name in ("vae", "dit") else (train_set, val_set)
+        result = RUN[name](plan, *sets, out, resume=resume, progress=progress, team=team)
         facts["metrics"] |= result.metrics
         facts["seconds"] |= {name: round(result.seconds, 1)}
         facts["commands"] |= {name: command}
