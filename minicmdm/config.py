@@ -273,14 +273,18 @@ PRESETS = {
 
 
 def preset(name: str, system: str = "cmdm") -> Preset:
-    """The preset of that name, as one of the four systems has it: what differs between them, and nothing else.
+    """The preset of that name, as one of the four systems has it. ValueError: an unknown name, with the known ones."""
+    if name not in PRESETS:
+        raise ValueError(f"unknown preset {name!r}: expected one of {', '.join(PRESETS)}")
+    return as_system(PRESETS[name], system)
 
-    Sizes, steps, text encoder and clock are the same for all. ValueError: an unknown name, with the known ones.
+
+def as_system(plan: Preset, system: str) -> Preset:
+    """A plan of CMDM's as another system has it: what differs between them, and nothing else.
+
+    Sizes, steps, text encoder and clock stay. ValueError: an unknown system.
     """
-    for what, value, known in (("preset", name, PRESETS), ("system", system, SYSTEMS)):
-        if value not in known:
-            raise ValueError(f"unknown {what} {value!r}: expected one of {', '.join(known)}")
-    plan = replace(PRESETS[name], system=system)
+    plan = replace(plan, system=system)
     if system == "cmdm":
         return plan
     plan = replace(plan, dit=replace(plan.dit, attention="bidirectional"))
@@ -291,6 +295,6 @@ def preset(name: str, system: str = "cmdm") -> Preset:
     root = plan.train.root_weight if system == "mardm" else 0.0
     train = replace(plan.train, align_weight=0.0, kl_weight=0.0, root_weight=root)
     masked = MaskedConfig(iterations=18 if system == "mardm" else 10)
-    if name in ("toy", "micro"):
+    if plan.dit.dim < 512:
         masked = replace(masked, head_dim=2 * plan.dit.dim, head_layers=3, codes=128)
     return replace(plan, vae=vae, train=train, masked=masked)
