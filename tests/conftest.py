@@ -69,7 +69,7 @@ def tiny_run(tmp_path_factory, fake_data, tiny_preset):
 
     folder = tmp_path_factory.mktemp("run") / "tiny"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stages, "preset", lambda name: tiny_preset)
+        patch.setattr(stages, "preset", lambda name, system: tiny_preset)
         patch.setattr(stages, "_datasets", lambda *_: (fake_data, make_fake_data(4, seed=1)))
         stages.train("tiny", folder, progress=False)
     # As after much training, nothing is exactly zero: a zero output layer would hide what tests look for.

@@ -26,7 +26,7 @@ def tiny_world(monkeypatch, fake_data):
     """stages.train on the made-up data, with a preset of the caller's."""
 
     def use(preset):
-        monkeypatch.setattr(stages, "preset", lambda name: preset)
+        monkeypatch.setattr(stages, "preset", lambda name, system: preset)
         monkeypatch.setattr(stages, "_datasets", lambda *_: (fake_data, make_fake_data(4, seed=1)))
 
     return use

@@ -1,6 +1,7 @@
 """Studies: many models, one CSV each, and the table that a CSV says.
 
-    python -m minicmdm.evaluation.studies vae|masks|objective|sampling       small models with seeds (small.py)
+    python -m minicmdm.evaluation.studies vae|masks|objective|sampling|grid  small models with seeds (small.py)
+    python -m minicmdm.evaluation.studies guidance                           the shipped systems (small.py)
     python -m minicmdm.evaluation.studies agreement|hearing|dimensions       what the judges hear (spoilt.py)
     python -m minicmdm.evaluation.studies drift|reaction                     streams, an hour long (drift.py)
 
@@ -27,6 +28,8 @@ ROWS = {
     "masks": small.mask_rows,
     "objective": small.objective_rows,
     "sampling": small.sampling_rows,
+    "grid": small.grid_rows,
+    "guidance": small.guidance_rows,
     "agreement": spoilt.agreement_rows,
     "hearing": spoilt.hearing_rows,
     "dimensions": spoilt.dimension_rows,
