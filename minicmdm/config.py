@@ -145,13 +145,13 @@ class Preset:
     """A whole system: what is built and how it is trained."""
 
     name: str
-    system: str = "cmdm"
     vae: VAEConfig = field(default_factory=VAEConfig)
     text: TextConfig = field(default_factory=TextConfig)
     tmr: TMRConfig = field(default_factory=TMRConfig)
     dit: DiTConfig = field(default_factory=DiTConfig)
-    masked: MaskedConfig = field(default_factory=MaskedConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
+    system: str = "cmdm"
+    masked: MaskedConfig = field(default_factory=MaskedConfig)
 
     def __post_init__(self):
         if self.system not in SYSTEMS:
@@ -187,7 +187,7 @@ class Preset:
             _check_keys(part, data[key], key)
         made = {key: part(**data[key]) for key, part in parts.items()}
         train = replace(made["train"], betas=tuple(made["train"].betas))  # JSON has lists only
-        return cls(data["name"], data.get("system", "cmdm"), **{**made, "train": train})
+        return cls(data["name"], system=data.get("system", "cmdm"), **{**made, "train": train})
 
 
 def _check_keys(cls, data, where: str, needed: Collection[str] = ()):
