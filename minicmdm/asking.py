@@ -37,8 +37,13 @@ class Asked:
 def usual_sampling(
     system: str, schedule: str | None, num_steps: int | None, uncertainty: int | None
 ) -> dict[str, str | int]:
-    """A system's own schedule, K and L, but for what is given. Another schedule comes with K = 20 and L = 2."""
+    """A system's own schedule, K and L, but for what is given. Another schedule comes with K = 20 and L = 2.
+
+    FloodDiffusion has learnt triangles of n_s latents, so with another K its L is K / n_s.
+    """
     usual = USUAL_SAMPLING[system if schedule is None else "cmdm"]
+    if usual[0] == "triangular" and uncertainty is None and isinstance(num_steps, int):
+        uncertainty = max(1, num_steps * usual[2] // usual[1])
     given = (schedule, num_steps, uncertainty)
     names = ("schedule", "num_steps", "uncertainty")
     return {name: own if value is None else value for name, value, own in zip(names, given, usual)}
