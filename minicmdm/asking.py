@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,6 +48,14 @@ def usual_sampling(
     given = (schedule, num_steps, uncertainty)
     names = ("schedule", "num_steps", "uncertainty")
     return {name: own if value is None else value for name, value, own in zip(names, given, usual)}
+
+
+def sampling_of(
+    pipe: object, schedule: str | None, num_steps: int | None, uncertainty: int | None
+) -> dict[str, str | int]:
+    """How a pipeline samples, but for what is given. Whoever answers in its place, like a baseline, is asked as CMDM."""
+    own = getattr(pipe, "sampling", partial(usual_sampling, "cmdm"))
+    return own(schedule, num_steps, uncertainty)
 
 
 def check_sampling(

@@ -149,17 +149,19 @@ def test_small_models_of_one_name_are_one_model(tmp_path, monkeypatch):
 
     seams = {"transition_fid": {"mean": 0.0}, "auj": {"mean": 0.0}}
     monkeypatch.setattr(small, "micro", micro)
-    monkeypatch.setattr(small, "answers", lambda pipe, **ask: asked.append(ask) or {})
+    found = {"oracle_accuracy": 0.0, "fid": 0.0}
+    monkeypatch.setattr(small, "answers", lambda pipe, limit=0, **ask: asked.append(ask) or dict(found))
     monkeypatch.setattr(small, "reconstruction", lambda *_, **__: {"metrics": {"mpjpe_mm": {"mean": 0.0}}})
     monkeypatch.setattr(small, "timelines", lambda *_, **__: {"metrics": seams})
-    for rows in (small.vae_rows, small.mask_rows, small.objective_rows, small.sampling_rows):
+    for rows in (small.vae_rows, small.mask_rows, small.objective_rows, small.sampling_rows, small.grid_rows):
         labels = []
         for label, measure in rows(tmp_path):
             labels.append(tuple(label.values()))
             measure()
         assert len(set(labels)) == len(labels) and len(labels) % 3 == 0  # three seeds of each
     plans = [plan for (_, seed), (plan, _) in made.items() if seed == 0]
-    assert len(plans) == 3 + 4 + 1 and all(a != b for a, b in combinations(plans, 2))  # flow is causal-random again
+    # flow, sampling and a cell of the grid are causal-random again
+    assert len(plans) == 3 + 4 + 1 + 7 and all(a != b for a, b in combinations(plans, 2))
     assert {ask.get("solver") for ask in asked} == {None, "euler", "ddpm", "ddim"}
 
 

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.random import Generator
 from tqdm import tqdm
 
+from minicmdm.asking import sampling_of
 from minicmdm.data import synthesis
 from minicmdm.data.dataset import toy_dataset, world_fingerprint
 from minicmdm.data.features import canonicalize, joints_to_features
@@ -85,7 +86,7 @@ def timelines(
     """
     check(protocol, evaluator, repeats, limit, compositions, prompts_each)
     count, each = (own or usual for own, usual in zip((compositions, prompts_each), HORIZONS[protocol]))
-    ask = {**pipe.sampling(schedule, num_steps, uncertainty), "guidance_scale": guidance_scale}
+    ask = {**sampling_of(pipe, schedule, num_steps, uncertainty), "guidance_scale": guidance_scale}
     pipe.stream(["a person stands"], num_frames=4, **ask)  # what the pipeline refuses, it refuses here
     clips = toy_dataset("test", limit, progress).clips
     source = [(segment, said) for clip in clips for segment, (_, _, said) in zip(clip.program, clip.labels)]

@@ -1,7 +1,6 @@
 """The protocols: how a pipeline is asked and judged. One dictionary of plain values comes out.
 
-    result = evaluate(MotionPipeline.from_pretrained("toy"), repeats=5)
-    print(table(result))
+    print(table(evaluate(MotionPipeline.from_pretrained("toy"), repeats=5)))
 
 Under "metrics" each key of `metrics.ARROWS` holds four numbers:
 
@@ -25,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
+from minicmdm.asking import sampling_of
 from minicmdm.data.clips import MotionDataset
 from minicmdm.data.dataset import Clip, make_clip, toy_dataset, world_fingerprint
 from minicmdm.data.features import features_to_joints
@@ -139,9 +139,9 @@ def text_to_motion(
     and so no `gt`, and the floor's motions differ in length too. Source: Guo et al. 2022; MARDM's evaluation.
     """
     check("t2m", evaluator, repeats, limit)
-    ask = {**pipe.sampling(schedule, num_steps, uncertainty), "guidance_scale": guidance_scale}
-    ask |= {} if solver is None else {"solver": solver}
-    pipe(["a person stands"], [4], seed=[0], **ask)  # what the pipeline refuses, it refuses here and not in a minute
+    ask = {**sampling_of(pipe, schedule, num_steps, uncertainty), "guidance_scale": guidance_scale, "solver": solver}
+    ask = {key: value for key, value in ask.items() if value is not None}
+    pipe(["a person stands"], [4], seed=[0], **ask)  # what the pipeline refuses, it refuses here
     clips, told, fingerprint = _test_set(data, limit, progress)
     judges = [bench[evaluator], bench["clip_essential"]]
     seen = {"gt": _see(judges, clips)}
@@ -169,8 +169,8 @@ def text_to_motion(
     summary = {key: _entry(*([row[key] for row in rows[name]] for name in rows)) for key in rows["gt"][0]}
     fields = {key: summary.pop(key) for key in FIELDS if key in summary}
     facts = {"protocol": "t2m", "evaluator": evaluator, "clips": len(clips), "pool": min(POOL, len(clips))}
-    facts["fingerprint"] = fingerprint
-    return {**facts, "repeats": repeats, **ask, "metrics": summary | {"multimodality": modes}, "fields": fields}
+    facts |= {"fingerprint": fingerprint, "repeats": repeats, **ask}
+    return {**facts, "metrics": summary | {"multimodality": modes}, "fields": fields}
 
 
 def reconstruction(

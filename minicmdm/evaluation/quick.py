@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from minicmdm.asking import sampling_of
 from minicmdm.data.dataset import Clip, toy_dataset, world_fingerprint
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
@@ -43,7 +44,7 @@ def evaluate_quick(
     `_gt` is the truth's own score, `_nearest` the baseline's whole clips on ordinary prompts; `mpjpe_mm` the VAE's
     reconstruction error, pelvis-aligned. Progress goes to stderr.
     """
-    start, plan = time.perf_counter(), pipe.sampling(schedule, num_steps, uncertainty)
+    start, plan = time.perf_counter(), sampling_of(pipe, schedule, num_steps, uncertainty)
     clips = toy_dataset("test", limit, progress).clips
     asked = [clip.program for clip in clips]
     truth = [_read(features_to_joints(clip.features)) for clip in clips]
