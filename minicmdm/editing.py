@@ -14,14 +14,16 @@ from torch import Tensor
 
 from minicmdm.data.features import features_of
 from minicmdm.motion import Motion
+from minicmdm.systems import VIEWS
 
 GIVEN = ("first_half", "second_half", "ends", "middle")
 SHORTEST = 16  # frames: a quarter of them is one latent
 
 
-def kept(encode: Callable[[Tensor], Tensor], motion: Motion, given: str) -> tuple[Tensor, Tensor]:
+def kept(encode: Callable[[Tensor], Tensor], motion: Motion, given: str, system: str = "cmdm") -> tuple[Tensor, Tensor]:
     """The latents (1,N,C) of what is given of a motion, zero elsewhere, and which they are, (N,) bool.
 
+    `encode` gets what the system sees of the whole motion, cut: coordinates of a part lie where the part does.
     ValueError: an unknown `given`, or a motion too short to have parts.
     """
     frames = len(motion)
@@ -30,6 +32,7 @@ def kept(encode: Callable[[Tensor], Tensor], motion: Motion, given: str) -> tupl
         raise ValueError(f"a motion of {frames} frames has no parts to keep: edit one of {SHORTEST} frames or more")
     features = features_of(motion.joints.astype(np.float64))
     features = np.concatenate([features, features[-1:].repeat(-frames % 4, 0)])  # (4N,D)
+    features = VIEWS.get(system, lambda all_of_them: all_of_them)(features)
     return encode_kept(encode, torch.from_numpy(features.astype(np.float32))[None], keep), keep
 
 

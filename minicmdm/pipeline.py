@@ -84,7 +84,7 @@ class MotionPipeline:
         checkpoints.save_vae(folder, self.vae, self.stats)
         checkpoints.save_dit(folder, self.dit)
         checkpoints.save_text(folder, self.text)
-        facts = {key: value for key, value in self.card.items() if key not in ("format", "preset", "files")}
+        facts = {key: value for key, value in self.card.items() if key not in ("format", "preset", "files", "shared")}
         checkpoints.write_card(folder, self.preset, facts)
         return folder
 
@@ -185,7 +185,7 @@ class MotionPipeline:
         self._check_prompt(prompt)
         ask = self._asked(None, None, None, None, guidance_scale, None)
         generator = torch.Generator().manual_seed(asking.integer(seed, "seed", 0, 2**63 - 1))
-        z, keep = kept(self.encode, motion, given)  # (1,N,C), (N,)
+        z, keep = kept(self.encode, motion, given, self.preset.system)  # (1,N,C), (N,)
         return self._motion(self._fill(z, keep, prompt, generator, ask)[0], len(motion), prompt)
 
     def _fill(self, z: Tensor, keep: Tensor, prompt: str, generator: torch.Generator, ask: asking.Asked) -> Tensor:

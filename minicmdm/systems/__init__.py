@@ -20,6 +20,7 @@ from minicmdm.systems.cdamd import DualTransformer
 from minicmdm.systems.mardm import MaskedTransformer
 
 MASKED = ("mardm", "cdamd")
+VIEWS = {"mardm": essential, "cdamd": coordinates}  # of 263 features, where a system does not see all of them
 
 
 def new_denoiser(plan: Preset) -> CausalDiT | MaskedTransformer:
@@ -37,7 +38,7 @@ def seen_by(system: str, data: MotionDataset, like: MotionDataset | None = None)
     """
     if system not in MASKED:
         return data
-    view = essential if system == "mardm" else coordinates
+    view = VIEWS[system]
     clips = [replace(clip, features=view(clip.features)) for clip in data.clips]
     if system == "mardm":
         mean, std = (view(x[None])[0] for x in (data.mean, data.std))

@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 
 from minicmdm.asking import Asked
-from minicmdm.data.features import coordinates, essential, features_of, features_to_joints
+from minicmdm.data.features import features_of, features_to_joints
 from minicmdm.live import MotionStream
 from minicmdm.motion import Motion
 from minicmdm.pipeline import MotionPipeline
+from minicmdm.systems import VIEWS
 from minicmdm.systems.mardm import unmask
 
 
@@ -53,7 +54,7 @@ class MaskedPipeline(MotionPipeline):
         """Features (B,T,263), or the system's own view of them (B,T,67 or 66) -> normalised latents (B,N,C)."""
         features = np.asarray(features)
         if features.shape[-1] != self.preset.vae.input_dim:
-            features = essential(features) if self.preset.system == "mardm" else coordinates(features)
+            features = VIEWS[self.preset.system](features)
         return super().encode(features)
 
     def _motion(self, latents: Tensor, frames: int, caption: str) -> Motion:
