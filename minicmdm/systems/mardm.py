@@ -22,6 +22,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from minicmdm.asking import MAX_FRAMES
 from minicmdm.config import Preset
 from minicmdm.diffusion.forcing import diffusion_forcing_loss
 from minicmdm.diffusion.sampling import from_noise_prediction, sample
@@ -31,6 +32,7 @@ from minicmdm.models.layers import modulate, sinusoid
 from minicmdm.models.text import Words
 
 NOISE, MASK = 0.1, 0.9 * 0.88  # of the masked latents become noise, and the mask vector; the rest stay as they are
+LONGEST = MAX_FRAMES // 4  # latents. Luck is drawn for so many, then cut: no sample depends on its company
 
 
 class HeadBlock(nn.Module):
@@ -205,7 +207,9 @@ def unmask(
     """
     channels = model.cfg.latent_dim
     z = wanted.new_zeros((*wanted.shape, channels), dtype=torch.float32) if given is None else given
-    order = torch.stack([torch.rand(wanted.shape[1], generator=g) for g in generators]).masked_fill(~wanted, 2.0)
+    num_latents = wanted.shape[1]
+    longest = max(num_latents, LONGEST)
+    order = torch.stack([torch.rand(longest, generator=g)[:num_latents] for g in generators]).masked_fill(~wanted, 2.0)
     turn = order.argsort(1).argsort(1)  # (B,N): who is revealed last has turn 0
     if not wanted.any():
         return z
@@ -213,7 +217,7 @@ def unmask(
         masked = wanted & (turn < count[:, None])
         shown = torch.where(masked.unsqueeze(-1), model.mask_vector, z)
         branches = [seen[masked] for seen in look(shown, ~masked)]  # each (M,dim)
-        noise = torch.stack([torch.randn(*wanted.shape[1:], channels, generator=g) for g in generators])[masked]
+        noise = torch.stack([torch.randn(longest, channels, generator=g)[:num_latents] for g in generators])[masked]
 
         def predict(x: Tensor, t: Tensor, branches=branches) -> Tensor:  # (1,M,C), (1,M)
             first, *rest = (model.head(x[0], t[0], seen)[None] for seen in branches)
