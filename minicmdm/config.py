@@ -87,10 +87,9 @@ class MaskedConfig:
     head_layers: int = 16
     repeats: int = 4  # noises drawn for every masked latent of a batch: the head is cheap, the transformer is not
     iterations: int = 18  # of unmasking; CDAMD takes 10
-    # CDAMD only
     mask: str = "meant"  # the reading of its dual-constrained mask, see systems/cdamd.py
     codes: int = 512  # of each level of the residual quantiser
-    code_levels: int = 4  # the paper's; the released default is 6
+    code_levels: int = 4  # the paper's; the released default is 6 (this and the two around it are CDAMD's alone)
     prior_drop: float = 0.7  # how often training hides the motion tokens, which sampling never has
 
 
@@ -280,10 +279,7 @@ def preset(name: str, system: str = "cmdm") -> Preset:
 
 
 def as_system(plan: Preset, system: str) -> Preset:
-    """A plan of CMDM's as another system has it: what differs between them, and nothing else.
-
-    Sizes, steps, text encoder and clock stay. ValueError: an unknown system.
-    """
+    """A plan of CMDM's as another system has it: words, clock, minutes and about the number of weights stay."""
     plan = replace(plan, system=system)
     if system == "cmdm":
         return plan
@@ -293,8 +289,10 @@ def as_system(plan: Preset, system: str) -> Preset:
     # An autoencoder that looks both ways. No alignment, and for coordinates no root columns that count again.
     vae = replace(plan.vae, input_dim=67 if system == "mardm" else 66, causal=False, deterministic=True)
     root = plan.train.root_weight if system == "mardm" else 0.0
-    train = replace(plan.train, align_weight=0.0, kl_weight=0.0, root_weight=root)
+    steps = plan.train.dit_steps * 3 // 4  # they take a third longer: the same minutes for all
+    train = replace(plan.train, align_weight=0.0, kl_weight=0.0, root_weight=root, dit_steps=steps)
     masked = MaskedConfig(iterations=18 if system == "mardm" else 10)
-    if plan.dit.dim < 512:
-        masked = replace(masked, head_dim=2 * plan.dit.dim, head_layers=3, codes=128)
+    if plan.dit.dim < 512:  # a third of the transformer's layers for a head: about as many weights as CMDM has
+        plan = replace(plan, dit=replace(plan.dit, layers=plan.dit.layers - plan.dit.layers // 3))
+        masked = replace(masked, head_dim=plan.dit.dim * 3 // 2, head_layers=3, repeats=2, codes=128)
     return replace(plan, vae=vae, train=train, masked=masked)

@@ -4,10 +4,12 @@ import json
 import pickle
 import shutil
 
+import numpy as np
 import pytest
 import torch
 
 from minicmdm.files import check_output, whole_file
+from minicmdm.pipeline import MotionPipeline
 from minicmdm.training import checkpoints
 
 
@@ -139,3 +141,25 @@ def test_check_output_refuses(name, error, message, tmp_path, monkeypatch):
     assert check_output("there.npy", (".npy",), force=True).name == "there.npy"
     assert check_output("New.NPY", (".npy",)).name == "New.NPY"
     assert [p.name for p in tmp_path.iterdir()] == ["there.npy"]
+
+
+def test_parts_that_two_checkpoints_have_in_common_are_shipped_once(tiny_run, tmp_path):
+    first, second = checkpoints.ship(tiny_run, tmp_path / "a"), checkpoints.ship(tiny_run, tmp_path / "b", beside="a")
+    assert sorted(path.name for path in second.iterdir()) == ["card.json", "dit.safetensors"]
+    motions = [MotionPipeline.from_pretrained(folder)("a person walks", 24, num_steps=2) for folder in (first, second)]
+    assert np.array_equal(motions[0].joints, motions[1].joints)
+    moved = tmp_path / "alone" / "b"
+    shutil.copytree(second, moved)
+    with pytest.raises(FileNotFoundError, match="lacks"):
+        checkpoints.load_checkpoint(moved)
+    card = json.loads((second / "card.json").read_text(encoding="utf-8"))
+    for wrong in ("../a", "..", "", 7, "/etc"):
+        text = json.dumps({**card, "shared": {"vae": wrong, "text": "a"}})
+        (second / "card.json").write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match="beside"):
+            checkpoints.load_checkpoint(second)
+    (second / "card.json").write_text(json.dumps(card), encoding="utf-8")
+    stats, note = checkpoints.load_tensors(first / "stats.safetensors")
+    checkpoints.save_tensors(first / "stats.safetensors", {k: v + 1 for k, v in stats.items()}, note)
+    with pytest.raises(ValueError, match="changed or mixed in"):
+        checkpoints.load_checkpoint(second)

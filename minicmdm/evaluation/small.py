@@ -128,27 +128,30 @@ def sampling_rows(scratch: Path) -> Rows:
 
 
 def grid_rows(scratch: Path) -> Rows:
-    """Attention x training levels x training length, each model sampled by a triangle of 5 latents and one by one.
+    """Attention x training levels x position x length of training; sampled by a triangle of 5 latents, and one by one.
 
     CMDM reports that causal x random works (FID 0.068), FloodDiffusion that bidirectional x triangle does (0.057) and
-    that the other two cells do not (3.377 and 3.883). The positional code is the same everywhere: rotary, and a clock.
+    that the other two cells do not (3.377 and 3.883). Rotary positions know distances only; "clock" tells a latent where
+    it is as well.
     """
     plan = shipped_vae(preset("micro"))
+    whole = plan.train.dit_steps
+    cells = [(attention, levels) for attention in ("causal", "bidirectional") for levels in ("random", "triangle")]
     for seed in SEEDS:
-        for steps in (plan.train.dit_steps // 2, plan.train.dit_steps):
-            for attention in ("causal", "bidirectional"):
-                for levels in ("random", "triangle"):
-                    dit = replace(plan.dit, attention=attention)
-                    own = replace(plan, dit=dit, train=replace(plan.train, levels=levels, dit_steps=steps))
-                    name = f"{attention}-{levels}" + ("" if steps == plan.train.dit_steps else f"-{steps}")
+        for position, steps in (("clock", whole), ("rotary", whole), ("clock", whole // 2)):
+            for attention, levels in cells:
+                dit = replace(plan.dit, attention=attention, clock=position == "clock")
+                own = replace(plan, dit=dit, train=replace(plan.train, levels=levels, dit_steps=steps))
+                name = f"{attention}-{levels}" + "-rotary" * (position == "rotary") + "-half" * (steps < whole)
 
-                    def measure(own=own, name=name, seed=seed) -> Row:
-                        pipe = micro(scratch, name, own, seed, ASSETS / "toy")
-                        some = answers(pipe, schedule="triangular", num_steps=20, uncertainty=4)
-                        alone = answers(pipe, schedule="autoregressive")
-                        return some | {f"{key}_one_by_one": alone[key] for key in ("oracle_accuracy", "fid")}
+                def measure(own=own, name=name, seed=seed) -> Row:
+                    pipe = micro(scratch, name, own, seed, ASSETS / "toy")
+                    row = answers(pipe, FEW, schedule="triangular", num_steps=20, uncertainty=4)
+                    alone = answers(pipe, FEW, schedule="autoregressive")
+                    return row | {f"{key}_one_by_one": alone[key] for key in ("oracle_accuracy", "fid")}
 
-                    yield {"attention": attention, "levels": levels, "steps": steps, "seed": seed}, measure
+                kind = {"attention": attention, "levels": levels, "position": position, "steps": steps}
+                yield {**kind, "seed": seed}, measure
 
 
 def guidance_rows(scratch: Path) -> Rows:

@@ -9,6 +9,9 @@ A checkpoint is a folder:
     stats.safetensors   mean and std of the features (263,), and of the latents (C,)
     card.json           preset, seed, data fingerprint, metrics, seconds, version, command, and the files' checksums
 
+Under "shared" the card may name a folder beside its own that holds the VAE or the text encoder, where two systems have
+the very same.
+
 The card is written last and names the checksum of every weight file, so a folder whose parts do not belong together
 (killed between two files, or mixed by hand) is recognised and refused instead of sampled.
 """
@@ -17,6 +20,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -39,6 +43,7 @@ from minicmdm.systems import MaskedTransformer, new_denoiser
 FORMAT = "minicmdm-checkpoint-1"
 WEIGHTS = ("vae.safetensors", "stats.safetensors", "dit.safetensors", "text/model.safetensors")  # what a motion takes
 FILES = (*WEIGHTS, "tmr.safetensors")
+PARTS = {"vae": ("vae.safetensors", "stats.safetensors"), "text": ("text/model.safetensors",)}  # that may be shared
 STATS = ("feature_mean", "feature_std", "latent_mean", "latent_std")
 
 
@@ -140,13 +145,14 @@ def save_text(folder: Path, text: TextEncoder) -> None:
                 temporary.write_bytes(file.read_bytes())
 
 
-def ship(source: str | Path, target: str | Path) -> Path:
+def ship(source: str | Path, target: str | Path, beside: str | None = None) -> Path:
     """Copy a checkpoint to the folder `target` with its weights in float16, half the size; statistics stay float32.
 
     That moves a weight by a two-thousandth of itself at most, and what is measured and told is measured on the copy.
+    Parts that are those of the checkpoint `beside`, a folder next to the target, are left there, and so is the teacher.
     """
     source, target = Path(source), Path(target)
-    card = read_card(source)
+    card, shared = read_card(source), {}
     (target / "text").mkdir(parents=True, exist_ok=True)
     for name in card["files"]:
         tensors, note = load_tensors(source / name)
@@ -154,14 +160,40 @@ def ship(source: str | Path, target: str | Path) -> Path:
         save_tensors(target / name, tensors if keep else {k: v.half() for k, v in tensors.items()}, note)
     for name in ("tokenizer.json", "config.json"):
         write_text(target / "text" / name, (source / "text" / name).read_text(encoding="utf-8"))
-    facts = {key: value for key, value in card.items() if key not in ("format", "preset", "files")}
-    write_card(target, read_preset(card, source), {**facts, "precision": "float16"})
+    for part, names in PARTS.items() if beside else ():
+        other = target.parent / beside
+        if all(checksum(target / name) == checksum(other / name) for name in names):
+            shared[part] = beside
+            for name in names:
+                (target / name).unlink()
+    if "text" in shared:
+        shutil.rmtree(target / "text")
+    if beside:
+        (target / "tmr.safetensors").unlink(missing_ok=True)
+    facts = {key: value for key, value in card.items() if key not in ("format", "preset", "files", "shared")}
+    write_card(target, read_preset(card, source), {**facts, "precision": "float16", "shared": shared})
     return target
+
+
+def home(folder: Path, card: Mapping, part: str) -> Path:
+    """The folder that holds a checkpoint's "vae" or "text". ValueError: a card that leads elsewhere than beside it."""
+    shared = card.get("shared") or {}
+    name = shared.get(part) if isinstance(shared, dict) else ""
+    if name is None:
+        return folder
+    if not isinstance(name, str) or not name or name != Path(name).name or name in (".", ".."):
+        raise ValueError(f"{folder / 'card.json'}: 'shared' names folders beside this one, and {name!r} came")
+    return folder.parent / name
+
+
+def _place(folder: Path, card: Mapping, name: str) -> Path:
+    part = next((part for part, names in PARTS.items() if name in names), "")
+    return home(folder, card, part) / name
 
 
 def write_card(folder: Path, preset: Preset, facts: Mapping[str, object]) -> None:
     """Write the card last: what the weights are, how they were made, and the checksum of every weight file."""
-    files = {name: checksum(folder / name) for name in FILES if (folder / name).is_file()}
+    files = {name: checksum(path) for name in FILES if (path := _place(folder, facts, name)).is_file()}
     card = {"format": FORMAT, "preset": preset.to_dict(), **facts, "files": files}
     write_text(folder / "card.json", json.dumps(card, indent=2) + "\n")
 
@@ -192,11 +224,12 @@ def read_card(folder: str | Path) -> dict:
     if not isinstance(files, dict) or not set(files) <= set(FILES):
         raise ValueError(f"{path} must name the checksums of the files {', '.join(FILES)} under 'files'")
     for name, expected in files.items():
-        if not (folder / name).is_file():
+        place = _place(folder, card, name)
+        if not place.is_file():
             raise FileNotFoundError(f"the checkpoint {folder} lacks {name}, which its card names")
-        if checksum(folder / name) != expected:
-            load_tensors(folder / name)  # a cut file says so itself; a whole one is simply not the card's
-            raise ValueError(f"{folder / name} is not the file that the card describes: it was changed or mixed in")
+        if checksum(place) != expected:
+            load_tensors(place)  # a cut file says so itself; a whole one is simply not the card's
+            raise ValueError(f"{place} is not the file that the card describes: it was changed or mixed in")
     return card
 
 
@@ -210,10 +243,10 @@ def load_checkpoint(folder: str | Path) -> Checkpoint:
             f"`minicmdm train --stage dit --out {folder}` trains what follows the VAE"
         )
     preset = read_preset(card, folder)
-    vae, stats = load_vae(folder, preset)
+    vae, stats = load_vae(home(folder, card, "vae"), preset)
     dit = _build(new_denoiser, preset, folder)
     load_weights(dit, folder / "dit.safetensors")
-    text = TextEncoder.load(folder / "text", preset.text)
+    text = TextEncoder.load(home(folder, card, "text") / "text", preset.text)
     return Checkpoint(preset, vae, dit.eval(), text.eval(), stats, card)
 
 

@@ -49,7 +49,8 @@ def train_dit(
         dit.quantizer.fit(torch.cat(latents.means), torch.Generator().manual_seed(step_key(cfg.seed, -4)))
     if cfg.compile:  # the elementwise work between the matmuls, more than half of a step, becomes a few loops
         transformer = dit.body if plan.system in MASKED else dit
-        for block in (*transformer.blocks, *transformer.word_blocks):
+        head = [dit.head] if plan.system in MASKED else []
+        for block in (*transformer.blocks, *transformer.word_blocks, *head):
             block.compile(dynamic=True)
     models = nn.ModuleDict({"dit": dit})
 
