@@ -80,8 +80,8 @@ def _prove_velocity(answer: Callable) -> None:
         z_t = interpolate(z, eps, ends)
         must(answer(guess, "eps", z_t, ends).isfinite().all(), "At t = 0, too, predicted noise needs a finite answer.")
         ends[:, -1] = 1.0
-        found = answer(z, "x0", interpolate(z, eps, ends), ends)
-        must((found[:, [0, -1]] == 0).all(), "Where t = 1 a latent is finished: predicted data give it no velocity.")
+        found = answer(guess, "x0", interpolate(z, eps, ends), ends)
+        must((found[:, [0, -1]] == 0).all(), "Where t = 1 a latent is finished: whatever the network says, it rests.")
 
 
 EXERCISES = (

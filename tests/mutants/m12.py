@@ -58,6 +58,9 @@ MUTANTS = {
         lambda p, target, z_t, t: (z_t - p) / column(t) if target == "eps" else to_velocity(p, target, z_t, t),  # 0/0
         lambda p, target, z_t, t: (p - z_t) / (1 - column(t)) if target == "x0" else to_velocity(p, target, z_t, t),
         lambda p, target, z_t, t: (
+            (p - z_t) / (1 - column(t)).clamp_min(1e-6) if target == "x0" else to_velocity(p, target, z_t, t)
+        ),  # a finished latent is thrown about
+        lambda p, target, z_t, t: (
             (p - z_t) / column(t).clamp_min(1e-3) if target == "x0" else to_velocity(p, target, z_t, t)
         ),  # the divisors exchanged
         lambda p, target, z_t, t: (
