@@ -141,10 +141,13 @@ def test_a_head_that_knows_the_answer_has_no_loss_and_a_silent_one_pays_the_targ
     z, valid = 2 * torch.randn(40, 30, C, generator=seeded()), torch.ones(40, 30, dtype=torch.bool)
     told = torch.cat([z, torch.zeros(40, 30, DIM - C)], -1)
     knows, _ = spied(Head(lambda x, t, c: (c[..., :C] - x) / (1 - t)), told)
-    silent, _ = spied(Head(lambda x, t, c: 0 * x))
+    asked = []
+    silent, _ = spied(Head(lambda x, t, c: asked.append(x) or 0 * x))
     of_one, of_other = (masked_loss(m, z, None, None, valid, None, seeded(3)) for m in (knows, silent))
     assert of_one < 1e-6  # each latent has its own condition, its own noise and its own time
     assert abs(of_other - (4 + 1)) < 0.3  # E |z - eps|^2
+    masked = int(draw_mask(valid, seeded(3)).sum())
+    assert asked[0].shape == (1, PLAN.masked.repeats * masked, C)  # each with several noises
 
 
 def test_padding_and_its_words_reach_no_loss_and_all_weights_learn(model):
