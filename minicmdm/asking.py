@@ -18,8 +18,8 @@ if TYPE_CHECKING:  # slow to import
 MIN_FRAMES, MAX_FRAMES = 4, 196  # one latent, and the longest motion of HumanML3D (9.8 s)
 MAX_STEPS = 1000
 MAX_GUIDANCE = 100.0
-# How each system samples unless told: the schedule, K and L. FloodDiffusion's triangle has n_s = K / L = 5 latents.
-USUAL_SAMPLING = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 20, 4)}
+# How each system samples unless told: schedule, K and L. FloodDiffusion's triangle has n_s = K / L = 5 latents.
+USUAL_SAMPLING = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2)}
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ def usual_sampling(
 def sampling_of(
     pipe: object, schedule: str | None, num_steps: int | None, uncertainty: int | None
 ) -> dict[str, str | int]:
-    """How a pipeline samples, but for what is given. Whoever answers in its place, like a baseline, is asked as CMDM."""
+    """How a pipeline samples, but for what is given. Whoever answers in its place is asked as CMDM is."""
     own = getattr(pipe, "sampling", partial(usual_sampling, "cmdm"))
     return own(schedule, num_steps, uncertainty)
 

@@ -111,7 +111,7 @@ def test_only_two_of_them_stream(pipe):
 
 
 def test_each_samples_in_its_own_way_unless_told(pipe):
-    usual = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 20, 4)}.get(pipe.preset.system, ("full", 20, 0))
+    usual = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2)}.get(pipe.preset.system, ("full", 10, 0))
     assert tuple(pipe.sampling(None, None, None).values()) == usual
     if pipe.preset.system not in MASKED:
         assert tuple(pipe.sampling("autoregressive", 7, None).values()) == ("autoregressive", 7, 2)

@@ -34,7 +34,7 @@ from minicmdm.systems import MASKED
 # On the first 128 validation prompts (`python -m minicmdm.evaluation.studies guidance`).
 GUIDANCE = {"cmdm": 3.0, "flood": 3.0, "mardm": 3.0, "cdamd": 3.0}
 LATENTS = 30
-SEAMS = 256  # test clips whose seams are looked at
+SEAMS = 128  # test clips whose seams are looked at
 COLUMNS = (
     *("oracle_accuracy", "oracle_accuracy_heldout", "r_at_1", "r_at_2", "r_at_3", "fid", "mm_dist", "multimodality"),
     *("clip_score", "pj", "auj"),

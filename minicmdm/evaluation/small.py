@@ -131,8 +131,8 @@ def grid_rows(scratch: Path) -> Rows:
     """Attention x training levels x position x length of training; sampled by a triangle of 5 latents, and one by one.
 
     CMDM reports that causal x random works (FID 0.068), FloodDiffusion that bidirectional x triangle does (0.057) and
-    that the other two cells do not (3.377 and 3.883). Rotary positions know distances only; "clock" tells a latent where
-    it is as well.
+    that the other two cells do not (3.377 and 3.883). Rotary positions know distances only; "clock" tells a latent
+    where it is as well.
     """
     plan = shipped_vae(preset("micro"))
     whole = plan.train.dit_steps

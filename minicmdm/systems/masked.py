@@ -22,7 +22,7 @@ class MaskedPipeline(MotionPipeline):
         """All of a motion is drawn together, hence "full"; how often, is the preset's `masked.iterations`."""
         if schedule not in (None, "full") or uncertainty not in (None, 0):
             raise ValueError(f"{self.preset.system} unmasks latents in random order: it has no schedule to choose")
-        return {"schedule": "full", "num_steps": 20 if num_steps is None else num_steps, "uncertainty": 0}
+        return {"schedule": "full", "num_steps": 10 if num_steps is None else num_steps, "uncertainty": 0}
 
     def stream(self, *_, **__) -> MotionStream:
         """There is none. ValueError."""
