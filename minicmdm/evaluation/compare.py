@@ -32,7 +32,7 @@ from minicmdm.pipeline import SHIPPED, MotionPipeline
 from minicmdm.systems import MASKED
 
 # On the first 128 validation prompts (`python -m minicmdm.evaluation.studies guidance`).
-GUIDANCE = {"cmdm": 3.0, "flood": 3.0, "mardm": 3.0, "cdamd": 3.0}
+GUIDANCE = {"cmdm": 3.0, "flood": 2.0, "mardm": 3.0, "cdamd": 2.0}
 LATENTS = 30
 SEAMS = 128  # test clips whose seams are looked at
 COLUMNS = (
