@@ -18,6 +18,7 @@ from minicmdm.data_commands import data_info, data_make, doctor, import_bvh
 from minicmdm.measure_commands import bench, evaluate
 
 CHECKPOINT = "toy, flood, mardm, cdamd, or a folder made by `minicmdm train` (default toy)"
+RIGID = "give every bone its length again, which a generated one keeps to about a centimetre"
 WRONG, INTERRUPTED, READER_GONE = 2, 130, 141  # exit codes; the last two are what a shell reports for the signals
 
 
@@ -74,8 +75,12 @@ def _parser() -> Parser:
 
     def sampling(sub: Parser, schedules: str) -> None:
         sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
-        sub.add_argument("--steps", type=int, help="K, denoising steps of each latent (default 20)")
-        sub.add_argument("--uncertainty", type=int, help="L, how many steps later the next latent starts (default 2)")
+        sub.add_argument(
+            "--steps", type=int, help="K, denoising steps a latent (default: the system's, of cmdm 20)"
+        )
+        sub.add_argument(
+            "--uncertainty", type=int, help="L, steps before the next latent starts (default: of cmdm 2)"
+        )
         sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
         sub.add_argument("--schedule", help=f"{schedules} (default: the system's, of cmdm fss)")
         sub.add_argument("--block", type=int, help="latents that are denoised together (default: the model's own)")
@@ -86,6 +91,7 @@ def _parser() -> Parser:
     sub.add_argument("prompt", metavar="PROMPT", help='what to do, for example "a person walks, then waves"')
     sub.add_argument("--out", default="motion.html", help=".html, .gif, .bvh or .npy (default motion.html)")
     sub.add_argument("--frames", type=int, default=120, help="length at 20 frames per second, 4 to 196 (default 120)")
+    sub.add_argument("--rigid", action="store_true", help=RIGID)
     sampling(sub, "fss, full or autoregressive")
 
     sub = command("stream", stream, "Turn lines of SECONDS<TAB>PROMPT into frames as they come: one JSON line each.")
@@ -93,6 +99,7 @@ def _parser() -> Parser:
         "file", metavar="FILE", nargs="?", default="-", help="the timeline (default -: stdin, line by line)"
     )
     sub.add_argument("--out", help="write a .jsonl or .npy file rather than to stdout")
+    sub.add_argument("--rigid", action="store_true", help=RIGID)
     sub.add_argument("--window", type=int, help="the most latents that one call sees (default 49, or those in flight)")
     sampling(sub, "fss, autoregressive or triangular")
 
@@ -179,9 +186,9 @@ def _parser() -> Parser:
     sub.add_argument(
         "--prompts-each", type=int, help="long or mtt: prompts in each (default 8 or 3; the papers' 32, 3)"
     )
-    sub.add_argument("--schedule", help="fss, full, autoregressive, triangular or trapezoid (default fss)")
-    sub.add_argument("--steps", type=int, help="K (default 20)")
-    sub.add_argument("--uncertainty", type=int, help="L (default 2)")
+    sub.add_argument("--schedule", help="fss, full, autoregressive, triangular or trapezoid (default: of cmdm fss)")
+    sub.add_argument("--steps", type=int, help="K (default: the system's, of cmdm 20)")
+    sub.add_argument("--uncertainty", type=int, help="L (default: the system's, of cmdm 2)")
     sub.add_argument("--guidance", type=float, help="guidance scale (default 3)")
     sub.add_argument("--repeats", type=int, help="how often all prompts are answered, or others drawn (default 5)")
     sub.add_argument("--limit", type=int, help="only the first so many test clips, at least 32 unless --quick")

@@ -8,6 +8,7 @@ import os
 import shlex
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 MOST_CELLS = 1_000_000  # of a printed matrix
@@ -37,6 +38,7 @@ def generate(arguments: argparse.Namespace) -> None:
         raise ValueError("the prompt is empty: say what to do, like 'a person walks, then waves'")
     out = check_output(arguments.out, ENDINGS, arguments.force)
     _one_thread()
+    from minicmdm.data.features import retarget
     from minicmdm.pipeline import MotionPipeline
 
     pipe = MotionPipeline.from_pretrained(arguments.checkpoint)
@@ -50,6 +52,8 @@ def generate(arguments: argparse.Namespace) -> None:
         block_size=arguments.block,
         seed=arguments.seed,
     )
+    if arguments.rigid:
+        motion = replace(motion, joints=retarget(motion.joints, path=False), features=None)
     motion.save(out, force=arguments.force)
     say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
 
@@ -82,6 +86,7 @@ def stream(arguments: argparse.Namespace) -> None:
     _one_thread()
     import numpy as np
 
+    from minicmdm.data.features import retarget
     from minicmdm.live import follow, frame_line
     from minicmdm.pipeline import MotionPipeline
 
@@ -103,8 +108,11 @@ def stream(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
     )
 
+    frames = follow(flow, first, lines)
+    if arguments.rigid:
+        frames = ((prompt, retarget(joints[None], path=False)[0]) for prompt, joints in frames)
     if out is None:
-        for number, (prompt, joints) in enumerate(follow(flow, first, lines)):
+        for number, (prompt, joints) in enumerate(frames):
             print(frame_line(number, prompt, joints), flush=True)
         return
     count = 0
@@ -116,7 +124,7 @@ def stream(arguments: argparse.Namespace) -> None:
 
         if out.suffix.lower() == ".npy":
             header()
-        for prompt, joints in follow(flow, first, lines):
+        for prompt, joints in frames:
             text = out.suffix.lower() == ".jsonl"
             file.write(frame_line(count, prompt, joints).encode() + b"\n" if text else joints.astype("<f4").tobytes())
             count += 1

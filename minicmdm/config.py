@@ -81,7 +81,7 @@ class DiTConfig:
 
 @dataclass(frozen=True)
 class MaskedConfig:
-    """What MARDM and CDAMD have besides a transformer: a diffusion head, and how much is unmasked at a time."""
+    """What MARDM and CDAMD have besides a transformer: a diffusion head and, from `mask` on for CDAMD alone, tokens."""
 
     head_dim: int = 1792
     head_layers: int = 16
@@ -89,7 +89,7 @@ class MaskedConfig:
     iterations: int = 18  # of unmasking; CDAMD takes 10
     mask: str = "meant"  # the reading of its dual-constrained mask, see systems/cdamd.py
     codes: int = 512  # of each level of the residual quantiser
-    code_levels: int = 4  # the paper's; the released default is 6 (this and the two around it are CDAMD's alone)
+    code_levels: int = 4  # the paper's; the released default is 6
     prior_drop: float = 0.7  # how often training hides the motion tokens, which sampling never has
 
 
@@ -110,6 +110,7 @@ class TrainConfig:
     tmr_batch: int = 128
     tmr_lr: float = 1e-4
     tmr_warmup: int = 500
+    tmr_word_drop: float = 0.0  # how often the text encoder learns without a word of its sentence (ours)
     # stage 3: the VAE, on short crops
     vae_steps: int = 150_000
     vae_batch: int = 256

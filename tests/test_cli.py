@@ -12,7 +12,7 @@ import pytest
 
 from minicmdm import cli, commands
 from minicmdm.data.dataset import make_clip
-from minicmdm.data.features import features_to_joints
+from minicmdm.data.features import features_to_joints, retarget
 
 
 @pytest.fixture(scope="module")
@@ -182,6 +182,8 @@ def test_generate_writes_joints_and_says_so_on_stderr(here, tiny_run, capsys):
     one, two, other = (np.load(here / name) for name in ("one.npy", "two.npy", "mine.npy"))
     assert one.shape == (30, 22, 3) and one.dtype == np.float32
     assert np.array_equal(one, two) and not np.array_equal(one, other)
+    assert cli.main([*command, "--out", "rigid.npy", "--rigid"]) == 0
+    np.testing.assert_allclose(np.load(here / "rigid.npy"), retarget(one, path=False), atol=1e-5)
 
 
 def test_inspect_reads_what_the_oracle_sees(here, capsys):

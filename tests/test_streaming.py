@@ -15,7 +15,7 @@ from model_helpers import randomise
 
 from minicmdm import cli
 from minicmdm.config import DiTConfig
-from minicmdm.data.features import features_to_joints
+from minicmdm.data.features import features_to_joints, retarget
 from minicmdm.diffusion.sampling import guided, sample
 from minicmdm.diffusion.schedules import cost, schedule_matrix
 from minicmdm.diffusion.streaming import LONGEST, LatentStream, pace
@@ -452,6 +452,8 @@ def test_a_timeline_becomes_frames_each_with_its_prompt(here, monkeypatch, capsy
     np.testing.assert_allclose(np.load("walk.npy", allow_pickle=False), expected, atol=1e-4)
     assert [json.loads(line) for line in open("walk.jsonl")] == frames
     assert sorted(path.name for path in here.iterdir()) == ["plan.tsv", "walk.jsonl", "walk.npy"]
+    assert cli.main(["stream", "plan.tsv", "--out", "walk.npy", "--rigid", "--force", *FLAGS]) == 0
+    np.testing.assert_allclose(np.load("walk.npy", allow_pickle=False), retarget(expected, path=False), atol=1e-4)
 
 
 def test_lines_are_read_no_sooner_than_needed(here, monkeypatch, capsys):

@@ -128,7 +128,9 @@ def test_drift_is_seen_where_it_is():
     assert row["finite"] == 1 and 0.8 < row["reach_m"] < 1.2 and row["frames_beyond"] == 0
     assert row["minutes 0-1"] > 0.9 and row["minutes 1-2"] < 0.2
     take.joints[7, 20, 0] += 2.0
-    assert drift.judged(take, 2, 1)["frames_beyond"] == 1 / len(take.joints)
+    row = drift.judged(take, 2, 1)
+    assert row["frames_beyond"] == 1 / len(take.joints) and row["reach_m"] > 2
+    assert row["rigid_frames_beyond"] == 0 and row["rigid_reach_m"] < 1.2 and row["rigid_minutes 0-1"] > 0.9
     take.joints[5, 3] = np.nan
     assert drift.judged(take, 2, 1)["finite"] == 0
 

@@ -82,9 +82,10 @@ def summary(name: str, rows: list[Row]) -> str:
             values = np.array([float(row[key]) for row in rows])
             lines.append(f"rank correlation of {key} with oracle accuracy: {correlation(truth, values)}")
     if name == "drift":
-        first, *_, last = (key for key in rows[0] if key.startswith("minutes"))
-        change = interval([float(row[last]) - float(row[first]) for row in rows])
-        lines.append(f"accuracy in {last} minus that in {first}: {change}, over {len(rows)} streams")
+        for body in ("minutes", "rigid_minutes"):
+            first, *_, last = (key for key in rows[0] if key.startswith(body))
+            change = interval([float(row[last]) - float(row[first]) for row in rows])
+            lines.append(f"accuracy in {last} minus that in {first}: {change}, over {len(rows)} streams")
     return "\n".join(lines)
 
 

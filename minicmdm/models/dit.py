@@ -26,6 +26,7 @@ from minicmdm.models.layers import Attention, KeyValueCache, Turns, modulate, si
 from minicmdm.models.text import Words
 
 ATTENTION = ("causal", "bidirectional", "window")
+TARGETS = ("v", "x0", "eps")
 CLOCK_DIM = 64  # waves for each of the clock's two numbers
 
 
@@ -139,6 +140,8 @@ class CausalDiT(nn.Module):
         super().__init__()
         if cfg.attention not in ATTENTION:
             raise ValueError(f"unknown attention {cfg.attention!r}: expected one of {', '.join(ATTENTION)}")
+        if cfg.target not in TARGETS:
+            raise ValueError(f"unknown target {cfg.target!r}: expected one of {', '.join(TARGETS)}")
         if cfg.block_size < 1:
             raise ValueError(f"block_size counts the latents of a block, at least 1, got {cfg.block_size}")
         self.cfg = cfg

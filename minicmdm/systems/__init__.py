@@ -25,9 +25,9 @@ VIEWS = {"mardm": essential, "cdamd": coordinates}  # of 263 features, where a s
 
 def new_denoiser(plan: Preset) -> CausalDiT | MaskedTransformer:
     """The plan's last stage, with new weights."""
-    return {"mardm": MaskedTransformer, "cdamd": DualTransformer}.get(plan.system, lambda plan: CausalDiT(plan.dit))(
-        plan
-    )
+    if plan.system in MASKED:
+        return MaskedTransformer(plan) if plan.system == "mardm" else DualTransformer(plan)
+    return CausalDiT(plan.dit)
 
 
 def seen_by(system: str, data: MotionDataset, like: MotionDataset | None = None) -> MotionDataset:

@@ -98,9 +98,8 @@ class ResidualQuantizer(nn.Module):
             counts.lerp_(chosen.sum(0), 1 - DECAY) if counts.any() else counts.copy_(chosen.sum(0))
             sums.lerp_(chosen.T @ left, 1 - DECAY) if sums.any() else sums.copy_(chosen.T @ left)
             dead = counts < DEAD
-            book.copy_(
-                torch.where(dead[:, None], _some(left, len(book), generator), sums / counts.clamp_min(DEAD)[:, None])
-            )
+            means = sums / counts.clamp_min(DEAD)[:, None]
+            book.copy_(torch.where(dead[:, None], _some(left, len(book), generator), means))
             sums.copy_(torch.where(dead[:, None], book, sums))
             counts.masked_fill_(dead, DEAD)
             left = left - book[_nearest(left, book)]
