@@ -75,12 +75,8 @@ def _parser() -> Parser:
 
     def sampling(sub: Parser, schedules: str) -> None:
         sub.add_argument("--seed", type=int, default=0, help="another seed, another motion (default 0)")
-        sub.add_argument(
-            "--steps", type=int, help="K, denoising steps a latent (default: the system's, of cmdm 20)"
-        )
-        sub.add_argument(
-            "--uncertainty", type=int, help="L, steps before the next latent starts (default: of cmdm 2)"
-        )
+        sub.add_argument("--steps", type=int, help="K, denoising steps a latent (default: the system's, of cmdm 20)")
+        sub.add_argument("--uncertainty", type=int, help="L, steps before the next latent starts (default: of cmdm 2)")
         sub.add_argument("--guidance", type=float, default=3.0, help="guidance scale; 1 turns guidance off (default 3)")
         sub.add_argument("--schedule", help=f"{schedules} (default: the system's, of cmdm fss)")
         sub.add_argument("--block", type=int, help="latents that are denoised together (default: the model's own)")

@@ -160,6 +160,28 @@ def denoising_step(dit, words, latents, plan):
     return denoiser.denoising_loss(dit, words, batches.draw_batch(latents, 8, 0.0, draws), plan, 0.0, draws)
 
 
+@pytest.mark.parametrize("attention", ["causal", "bidirectional", "window"])
+def test_who_looks_ahead_learns_without_a_future(attention, latents, fake_data, tiny_preset, monkeypatch):
+    """A sampler hides latents that wait; with independent levels, a mask that looks ahead must have met that."""
+    seen = []
+
+    def loss(dit, z, words, mask, visible, **more):
+        seen.append((visible, more["committed"], more["t"]))
+        return z.sum()
+
+    monkeypatch.setattr(denoiser, "diffusion_forcing_loss", loss)
+    plan = replace(tiny_preset, dit=replace(tiny_preset.dit, attention=attention))
+    text = representation.new_text_encoder(tiny_preset, fake_data)
+    batch, draws = batches.draw_batch(latents, 64, 0.0, generator()), generator()
+    denoiser.denoising_loss(CausalDiT(plan.dit), WordCache(text, []), batch, plan, 0.0, draws)
+    ((visible, committed, t),) = seen
+    hidden = (batch.valid & ~visible).sum(1)
+    assert not (visible & ~batch.valid).any() and visible[:, 0].all()
+    assert (committed is not None) == (attention == "window")
+    assert (hidden > 0).any() == (attention != "causal") and (hidden == 0).any()
+    assert (t < 1).all()
+
+
 def test_both_losses_fall_on_one_batch(latents, fake_data, tiny_preset):
     torch.manual_seed(0)
     vae, x = MACVAE(tiny_preset.vae), batches.crop_features(fake_data, 8, 32, generator())[0]

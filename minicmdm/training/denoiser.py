@@ -104,8 +104,9 @@ def denoising_loss(
         t, committed, visible = draw_triangle(batch.valid, plan.train.overlap, generator)
     else:
         t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
-        if plan.dit.attention == "window":
-            committed, visible = draw_boundary(batch.valid, block_size, generator)
+        if plan.dit.attention != "causal":  # who looks ahead must have seen motions whose rest still waits, hidden
+            past, visible = draw_boundary(batch.valid, block_size, generator)
+            committed = past if plan.dit.attention == "window" else None
     said = words.encode(batch.sentences, word_drop, generator)  # each sentence once: (U,S1,E)
     device = next(dit.parameters()).device
     batch, said = batch.to(device), Words(said.embeddings.to(device), said.mask.to(device))
