@@ -75,7 +75,7 @@ def edit(arguments: argparse.Namespace) -> None:
     how = {"guidance_scale": arguments.guidance, "seed": arguments.seed}
     motion = pipe.edit(Motion(joints, fps=pipe.skeleton.fps), arguments.given, prompt, **how)
     motion.save(out, force=arguments.force)
-    say(f"wrote {out} ({len(motion)} frames, of which the {arguments.given.replace('_', ' ')} was given)")
+    say(f"wrote {out} ({len(motion)} frames; given: {arguments.given.replace('_', ' ')})")
 
 
 def stream(arguments: argparse.Namespace) -> None:

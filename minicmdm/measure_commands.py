@@ -27,7 +27,8 @@ def evaluate(arguments: argparse.Namespace) -> None:
     if arguments.compare:
         more = [key for key in (*asked, *sampling) if key not in ("repeats", "limit")] + ["quick"] * arguments.quick
         if more:
-            raise ValueError(f"--compare measures every system in its own way: leave out --{more[0].replace('_', '-')}")
+            flag = {"num_steps": "steps", "guidance_scale": "guidance"}.get(more[0], more[0].replace("_", "-"))
+            raise ValueError(f"--compare measures every system in its own way: leave out --{flag}")
     if arguments.limit is not None and arguments.limit < 1:
         raise ValueError(f"--limit must be at least 1, and {arguments.limit} came")
     _one_thread()
