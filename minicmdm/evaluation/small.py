@@ -139,8 +139,8 @@ def grid_rows(scratch: Path) -> Rows:
     plan = shipped_vae(preset("micro"))
     whole = plan.train.dit_steps
     cells = [(attention, levels) for attention in ("causal", "bidirectional") for levels in ("random", "triangle")]
-    for seed in SEEDS:
-        for position, steps in (("clock", whole), ("rotary", whole), ("clock", whole // 2)):
+    for position, steps in (("clock", whole), ("clock", whole // 2), ("rotary", whole)):
+        for seed in SEEDS:
             for attention, levels in cells:
                 dit = replace(plan.dit, attention=attention, clock=position == "clock")
                 own = replace(plan, dit=dit, train=replace(plan.train, levels=levels, dit_steps=steps))

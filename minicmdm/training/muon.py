@@ -58,9 +58,6 @@ def orthogonal(matrices: Tensor) -> Tensor:
 
 
 def inner_matrices(models: nn.Module) -> list[Tensor]:
-    """The weights Muon is for: matrices in the repeated blocks of a transformer, not what embeds or reads out.
-
-    The denoiser's word blocks are left out: where they had Muon too, new phrases were understood less (README).
-    """
-    named = models.named_parameters()
-    return [w for name, w in named if w.ndim == 2 and "blocks" in name.split(".") and w.requires_grad]
+    """The weights Muon is for: matrices in the repeated blocks of a transformer, not what embeds or reads out."""
+    repeated, named = {"blocks", "word_blocks"}, models.named_parameters()
+    return [w for name, w in named if w.ndim == 2 and repeated & set(name.split(".")) and w.requires_grad]
