@@ -102,9 +102,9 @@ def test_intervals_and_correlations_against_hand_computed_ones():
 @pytest.mark.parametrize("name", [name for name in studies.ROWS if studies.read(name)])
 def test_committed_rows_can_be_told(name):
     rows = studies.read(name)
-    kinds = {tuple(row[key] for key in row if key not in ("seed", *small.KEYS, "mpjpe_mm")) for row in rows}
+    labels = list(rows[0])[: list(rows[0]).index("seed")] if "seed" in rows[0] else list(rows[0])
     told = studies.summary(name, rows).splitlines()
-    assert len(told) > (len(kinds) if "seed" in rows[0] else len(rows))  # a line for the head, and one for each
+    assert len(told) > len({tuple(row[key] for key in labels) for row in rows})  # a line for the head, and one for each
 
 
 def test_a_script_fills_its_minutes_with_prompts_of_five_to_ten_seconds():
@@ -137,9 +137,16 @@ def test_drift_is_seen_where_it_is():
 
 def test_a_study_with_seeds_is_told_with_intervals():
     rows = [{"K": 20, "L": k % 2, "seed": k // 2, "fid": float(k)} for k in range(6)]
-    told = studies.summary("sampling", rows).splitlines()
+    told = studies.summary("masks", rows).splitlines()
     assert told[0].split() == ["K", "L", "fid"] and told[1].split() == ["20", "0", "2", "±", "5"]
     assert len(told) == 3  # two settings, three seeds each
+
+
+def test_settings_of_one_model_are_compared_seed_by_seed(monkeypatch):
+    monkeypatch.setattr(studies, "PAIRS", {"sampling": [("20 1", "20 0")]})
+    rows = [{"K": "20", "L": str(L), "seed": seed, "fid": 100.0 * seed + L} for seed in range(3) for L in range(2)]
+    last = studies.summary("sampling", rows).splitlines()[-1]
+    assert last.strip().startswith("20 1 minus 20 0") and last.endswith(" 1 ± 0")
 
 
 def test_small_models_of_one_name_are_one_model(tmp_path, monkeypatch):

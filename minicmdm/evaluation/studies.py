@@ -38,6 +38,10 @@ ROWS = {
 }
 
 
+# Rows of one model each, asked in two ways: seed by seed their differences are far less noisy than their means.
+PAIRS = {"sampling": [("fss 20 2", "autoregressive 20 20"), ("fss 20 1", "fss 20 10"), ("fss 50 5", "fss 20 2")]}
+
+
 def run(name: str, folder: Path, scratch: Path) -> list[Row]:
     """Measure what `folder`/NAME.csv lacks, row by row; return all rows."""
     path, done = folder / f"{name}.csv", read(name, folder)
@@ -72,6 +76,10 @@ def summary(name: str, rows: list[Row]) -> str:
         for kind in dict.fromkeys(tuple(row[key] for key in labels) for row in rows):
             same = [row for row in rows if tuple(row[key] for key in labels) == kind]
             table.append([*kind, *(interval([float(row[key]) for row in same]) for key in keys)])
+        for one, other in PAIRS.get(name, ()):
+            first, second = ([row for row in rows if [row[k] for k in labels] == kind.split()] for kind in (one, other))
+            change = (interval([float(a[key]) - float(b[key]) for a, b in zip(first, second)]) for key in keys)
+            table.append([f"{one} minus {other}", *[""] * (len(labels) - 1), *change])
     else:
         table = [list(rows[0]), *([row[key] for key in rows[0]] for row in rows)]
     widths = [max(len(str(line[k])) for line in table) for k in range(len(table[0]))]
