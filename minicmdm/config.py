@@ -110,7 +110,6 @@ class TrainConfig:
     tmr_batch: int = 128
     tmr_lr: float = 1e-4
     tmr_warmup: int = 500
-    tmr_word_drop: float = 0.0  # how often the text encoder learns without a word of its sentence (ours)
     # stage 3: the VAE, on short crops
     vae_steps: int = 150_000
     vae_batch: int = 256
@@ -228,13 +227,10 @@ PRESETS = {
             vae_warmup=100,
             kl_weight=1e-2,
             root_weight=10.0,  # a wrong yaw step turns all that follows, so it counts more than the release's 0.05
-            dit_steps=5_800,
+            dit_steps=6_500,
             dit_batch=48,
             dit_lr=1.5e-3,
             dit_warmup=300,
-            dit_muon=1e-2,
-            time_power=1.5,
-            word_drop=0.1,
             ema=0.999,
             weight_decay=0.0,
         ),

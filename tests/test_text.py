@@ -12,7 +12,7 @@ from conftest import make_fake_data, make_tiny_preset
 from safetensors.torch import load_file, save_file
 
 from minicmdm.config import TextConfig, preset
-from minicmdm.models.text import MINILM, TextEncoder, find_encoder, hide_words, pretrained_config, with_encoder
+from minicmdm.models.text import MINILM, TextEncoder, find_encoder, pretrained_config, with_encoder
 from minicmdm.models.wordcache import WordCache
 
 TINY = TextConfig(dim=16, layers=1, heads=2, vocab_size=120, max_words=12, dropout=0.1, frozen=False)
@@ -366,38 +366,3 @@ def pretrained_here(name):
         return bool(find_encoder(name))
     except FileNotFoundError:
         return False
-
-
-def test_some_words_are_hidden_and_never_the_marks():
-    mask = torch.arange(12) < torch.tensor([12, 7, 2, 3])[:, None]  # the third is "", the fourth has one word
-    assert hide_words(mask, 0.0, torch.Generator()) is mask
-    hidden = torch.zeros(4, 12)
-    for seed in range(400):
-        seen = hide_words(mask, 0.25, torch.Generator().manual_seed(seed))
-        assert not (seen & ~mask).any()
-        hidden += (mask & ~seen).float()
-    for row, length in enumerate((12, 7, 2, 3)):
-        assert hidden[row, 0] == hidden[row, length - 1] == 0 and not hidden[row, length:].any()
-        inner = hidden[row, 1 : length - 1] / 400
-        assert ((inner > 0.15) & (inner < 0.35)).all()
-
-
-def test_a_hidden_word_leaves_no_trace(encoder):
-    """What the encoder and the mean over words see is the same whatever the hidden words were."""
-    told, other = "a person walks forward", "the person jumps forward"
-    traces = {}
-    for seed in range(200):
-        one, two = (encoder.encode([s], 0.6, torch.Generator().manual_seed(seed)) for s in (told, other))
-        assert torch.equal(one.mask, two.mask)
-        seen = one.mask[0]
-        if not seen[1] and not seen[3]:  # the words that differ, behind [CLS], are hidden
-            traces[seed] = torch.allclose(one.embeddings[0, seen], two.embeddings[0, seen], atol=1e-6)
-        elif seen[1] and seen[3]:
-            assert not torch.allclose(one.embeddings[0, seen], two.embeddings[0, seen], atol=1e-6)
-    assert len(traces) > 20 and all(traces.values())
-
-
-def test_words_that_were_read_before_hide_as_many(encoder):
-    known = WordCache(encoder, CAPTIONS)
-    masks = [source.encode(CAPTIONS, 0.5, torch.Generator().manual_seed(3)).mask for source in (known, encoder)]
-    assert torch.equal(*masks) and masks[0].sum() < known.encode(CAPTIONS).mask.sum()

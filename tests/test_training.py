@@ -330,3 +330,18 @@ for step in itertools.count():
     process.wait()
     tensors, step = checkpoints.load_tensors(state)
     assert (tensors["a"] == step).all() and (tensors["b"] == step).all()
+
+
+def test_some_words_are_hidden_and_never_the_marks():
+    mask = torch.arange(12) < torch.tensor([12, 7, 2, 3])[:, None]  # the third is "", the fourth has one word
+    words = Words(torch.randn(4, 12, 3), mask)
+    assert denoiser.hide_words(words, 0.0, torch.Generator()) is words
+    hidden = torch.zeros(4, 12)
+    for seed in range(400):
+        seen = denoiser.hide_words(words, 0.25, torch.Generator().manual_seed(seed))
+        assert seen.embeddings is words.embeddings and not (seen.mask & ~mask).any()
+        hidden += (mask & ~seen.mask).float()
+    for row, length in enumerate((12, 7, 2, 3)):
+        assert hidden[row, 0] == hidden[row, length - 1] == 0 and not hidden[row, length:].any()
+        inner = hidden[row, 1 : length - 1] / 400
+        assert ((inner > 0.15) & (inner < 0.35)).all()

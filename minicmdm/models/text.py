@@ -168,35 +168,18 @@ class TextEncoder(nn.Module):
     def train(self, mode: bool = True) -> "TextEncoder":
         return super().train(mode and not self.cfg.frozen)
 
-    def encode(self, sentences: list[str], hide: float = 0.0, generator: torch.Generator | None = None) -> Words:
-        """Sentences -> Words: embeddings (B,S,E) and mask (B,S); S is the longest sentence's word pieces.
-
-        `hide` is the share of words that the encoder does not get to see (`hide_words`), and they are masked after it.
-        """
+    def encode(self, sentences: list[str]) -> Words:
+        """Sentences -> Words: embeddings (B,S,E) and mask (B,S); S is the longest sentence's word pieces."""
         _check_sentences(sentences)
         device = self.bert.device
         encoded = self.tokenizer.encode_batch(list(sentences))
         ids = torch.tensor([line.ids for line in encoded], device=device)  # (B,S)
         mask = torch.tensor([line.attention_mask for line in encoded], device=device)  # (B,S)
-        mask = hide_words(mask.bool(), hide, generator).long()
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self.cfg.frozen):
             embeddings = self.bert(input_ids=ids, attention_mask=mask).last_hidden_state  # (B,S,E)
         return Words(embeddings, mask.bool())
 
     forward = encode
-
-
-def hide_words(mask: Tensor, share: float, generator: torch.Generator | None) -> Tensor:
-    """Hide a share of the words of each sentence, mask (B,S), but never its marks [CLS] and [SEP]. Drawn on the CPU.
-
-    Captions say most things twice ("sits down on a chair"), and who always sees all of a phrase learns the phrase. Who
-    has to do without some of its words should learn what each of them means.
-    """
-    if share == 0:
-        return mask
-    place = torch.arange(mask.shape[1], device=mask.device)
-    inner = (place > 0) & (place < mask.sum(1, keepdim=True) - 1)  # (B,S)
-    return mask & ~(inner & (torch.rand(mask.shape, generator=generator) < share).to(mask.device))
 
 
 def find_encoder(name: str | Path) -> Path:

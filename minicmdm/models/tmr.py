@@ -154,15 +154,13 @@ class MotionTeacher(nn.Module):
         """The mean over time of `frames`: valid ones, or all as in the release (`cfg.mean`). -> (B,embed_dim)."""
         return masked_mean(self.frames(x, valid), None if self.cfg.mean == "padded" else valid)
 
-    def sentences(self, sentences: list[str], hide: float = 0.0, generator: torch.Generator | None = None) -> Tensor:
+    def sentences(self, sentences: list[str]) -> Tensor:
         """The mean over a sentence's words of a linear map of their vectors. -> (B,embed_dim).
 
         The release reads [CLS] alone, so nothing asks the other words' vectors to mean anything; but the denoiser
         attends to all of them. The mean asks all of them, [CLS] and [SEP] included, which are all that "" has.
-        `hide` is the share of words that are not seen, for training.
         """
-        said = self.text.encode(sentences, hide, generator)
-        words, mask = (part.to(self.log_scale.device) for part in said)  # (B,S,E), (B,S)
+        words, mask = (part.to(self.log_scale.device) for part in self.text.encode(sentences))  # (B,S,E), (B,S)
         return masked_mean(self.embed_words(words), mask)
 
     def similarity(self, motion: Tensor, text: Tensor) -> Tensor:

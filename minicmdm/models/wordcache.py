@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from minicmdm.files import cache_folder, whole_file
-from minicmdm.models.text import TextEncoder, Words, hide_words
+from minicmdm.models.text import TextEncoder, Words
 
 
 class WordCache:
@@ -50,18 +50,15 @@ class WordCache:
         read = self.text.encode(sentences)
         self.known |= {s: e[m].cpu().clone() for s, e, m in zip(sentences, read.embeddings, read.mask)}
 
-    def encode(self, sentences: list[str], hide: float = 0.0, generator: torch.Generator | None = None) -> Words:
-        """As `TextEncoder.encode`, on the CPU and without gradients; a sentence that is new is read by itself.
-
-        Words are hidden after the encoder has read them: what is left may still say what they were.
-        """
+    def encode(self, sentences: list[str]) -> Words:
+        """As `TextEncoder.encode`, on the CPU and without gradients; a sentence that is new is read by itself."""
         for sentence in sentences:
             if sentence not in self.known:
                 self._read([sentence])
         rows = [self.known[s] for s in sentences]
         lengths = torch.tensor([len(row) for row in rows])
         embeddings = nn.utils.rnn.pad_sequence(rows, batch_first=True)  # (B,S,E)
-        return Words(embeddings, hide_words(torch.arange(embeddings.shape[1]) < lengths[:, None], hide, generator))
+        return Words(embeddings, torch.arange(embeddings.shape[1]) < lengths[:, None])
 
 
 def _words_file(text: TextEncoder, sentences: list[str], group: int) -> Path:

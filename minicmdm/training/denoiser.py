@@ -107,7 +107,7 @@ def denoising_loss(
         if plan.dit.attention != "causal":  # who looks ahead must have seen motions whose rest still waits, hidden
             past, visible = draw_boundary(batch.valid, block_size, generator)
             committed = past if plan.dit.attention == "window" else None
-    said = words.encode(batch.sentences, word_drop, generator)  # each sentence once: (U,S1,E)
+    said = hide_words(words.encode(batch.sentences), word_drop, generator)  # each sentence once: (U,S1,E)
     device = next(dit.parameters()).device
     batch, said = batch.to(device), Words(said.embeddings.to(device), said.mask.to(device))
     t, visible = t.to(device), visible.to(device)
@@ -129,3 +129,17 @@ def denoising_loss(
             committed=committed,
             t=t,
         )
+
+
+def hide_words(words: Words, share: float, generator: torch.Generator) -> Words:
+    """Hide a share of the words of each sentence (U,S) from the denoiser, but never its marks [CLS] and [SEP].
+
+    Captions say most things twice ("sits down on a chair"), and a model that always sees all of a phrase learns the
+    phrase. One that has to do without some of its words should learn what each of them means (README).
+    """
+    if share == 0:
+        return words
+    place = torch.arange(words.mask.shape[1])
+    inner = (place > 0) & (place < words.mask.sum(1, keepdim=True) - 1)  # (U,S)
+    hidden = inner & (torch.rand(words.mask.shape, generator=generator) < share)
+    return Words(words.embeddings, words.mask & ~hidden)

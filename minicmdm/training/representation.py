@@ -66,7 +66,7 @@ def train_teacher(
         x, valid, captions, same = batch
         teacher, x, valid, same = models["tmr"], x.to(team.device), valid.to(team.device), same.to(team.device)
         with torch.autocast(team.device.type, torch.bfloat16, enabled=cfg.bfloat16):
-            motion, words = teacher.motion(x, valid), teacher.sentences(captions, cfg.tmr_word_drop, generator)
+            motion, words = teacher.motion(x, valid), teacher.sentences(captions)  # (B,E) each
         value = contrastive_loss(teacher.similarity(motion, words), same)
         return value, {"scale": teacher.log_scale.exp().item()}
 
