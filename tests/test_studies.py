@@ -10,9 +10,10 @@ import torch
 from minicmdm.data.dataset import toy_dataset
 from minicmdm.data.features import features_to_joints
 from minicmdm.data.oracle import read_motion
-from minicmdm.evaluation import drift, small, studies
+from minicmdm.evaluation import drift, reading, small, studies
 from minicmdm.evaluation.horizon import act_out, draw
 from minicmdm.evaluation.spoilt import Spoilt
+from minicmdm.models.text import Words
 from minicmdm.motion import Motion
 
 
@@ -178,3 +179,17 @@ def test_a_prompt_that_latents_in_flight_hear_comes_sooner():
     rows = [drift.reaction(10, reach, pairs=2, before=9, after=12) for reach in ("new", "active")]
     assert rows[1]["reaction_frames"] == 3 < rows[0]["reaction_frames"] <= 3 + 4 * 2  # 3 are left of a latent
     assert all(0 <= row["oracle_accuracy"] <= 1 for row in rows)
+
+
+def test_a_probe_reads_the_words_and_padding_changes_nothing():
+    found = reading.read(0, 150, 256)
+    assert found["ordinary"]["action"] > 0.5 and found["ordinary"]["all"] <= min(
+        found["ordinary"][field] for field in reading.FIELDS
+    )
+    torch.manual_seed(0)
+    probe = reading.Probe(8, [["a", "b"], ["c", "d", "e"]]).eval()
+    words = Words(torch.randn(2, 5, 8), torch.arange(5) < torch.tensor([[5], [3]]))
+    other = Words(words.embeddings.masked_fill(~words.mask[..., None], 9.0), words.mask)
+    for one, two, options in zip(probe(words), probe(other), (2, 3)):
+        assert one.shape == (2, options)
+        torch.testing.assert_close(one, two)

@@ -3,6 +3,7 @@
     python -m minicmdm.evaluation.studies vae|masks|objective|sampling|grid  small models with seeds (small.py)
     python -m minicmdm.evaluation.studies guidance                           the shipped systems (small.py)
     python -m minicmdm.evaluation.studies agreement|hearing|dimensions       what the judges hear (spoilt.py)
+    python -m minicmdm.evaluation.studies reading                            what the frozen words say (reading.py)
     python -m minicmdm.evaluation.studies drift|reaction                     streams, an hour long (drift.py)
 
 Each row is written as soon as it is measured, and rows that are there already are not measured again: a study that was
@@ -18,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from minicmdm.evaluation import drift, small, spoilt
+from minicmdm.evaluation import drift, reading, small, spoilt
 from minicmdm.evaluation.small import Row
 from minicmdm.pipeline import ASSETS
 
@@ -33,6 +34,7 @@ ROWS = {
     "agreement": spoilt.agreement_rows,
     "hearing": spoilt.hearing_rows,
     "dimensions": spoilt.dimension_rows,
+    "reading": reading.reading_rows,
     "drift": drift.drift_rows,
     "reaction": drift.reaction_rows,
 }
