@@ -53,7 +53,7 @@ def generate(arguments: argparse.Namespace) -> None:
         seed=arguments.seed,
     )
     if arguments.rigid:
-        motion = replace(motion, joints=retarget(motion.joints, path=False), features=None)
+        motion = replace(motion, joints=retarget(motion.joints, scale_path=False), features=None)
     motion.save(out, force=arguments.force)
     say(f"wrote {out} ({len(motion)} frames, {motion.seconds:.1f} s)")
 
@@ -110,7 +110,7 @@ def stream(arguments: argparse.Namespace) -> None:
 
     frames = follow(flow, first, lines)
     if arguments.rigid:
-        frames = ((prompt, retarget(joints[None], path=False)[0]) for prompt, joints in frames)
+        frames = ((prompt, retarget(joints[None], scale_path=False)[0]) for prompt, joints in frames)
     if out is None:
         for number, (prompt, joints) in enumerate(frames):
             print(frame_line(number, prompt, joints), flush=True)

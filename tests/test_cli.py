@@ -186,7 +186,7 @@ def test_generate_writes_joints_and_says_so_on_stderr(here, tiny_run, capsys):
     assert one.shape == (30, 22, 3) and one.dtype == np.float32
     assert np.array_equal(one, two) and not np.array_equal(one, other)
     assert cli.main([*command, "--out", "rigid.npy", "--rigid"]) == 0
-    np.testing.assert_allclose(np.load(here / "rigid.npy"), retarget(one, path=False), atol=1e-5)
+    np.testing.assert_allclose(np.load(here / "rigid.npy"), retarget(one, scale_path=False), atol=1e-5)
 
 
 def test_inspect_reads_what_the_oracle_sees(here, capsys):

@@ -143,6 +143,8 @@ def test_shape_errors_name_the_argument(model, name, index, shape):
 def test_unknown_attention_and_block_size():
     with pytest.raises(ValueError, match="causal, bidirectional"):
         CausalDiT(replace(TINY, attention="sideways"))
+    with pytest.raises(ValueError, match="v, x0, eps"):
+        CausalDiT(replace(TINY, target="score"))
     with pytest.raises(ValueError, match="block_size"):
         CausalDiT(replace(TINY, block_size=0))
 

@@ -200,12 +200,14 @@ def test_bones_get_their_length_back_where_the_body_stands():
     """What a generated motion needs: frame by frame, with no frame 0 that scales the path, so a stream may use it."""
     joints = smooth_motion(4)
     wrong = joints + np.random.default_rng(0).normal(0, 0.01, joints.shape)
-    rigid = ft.retarget(wrong, path=False)
+    rigid = ft.retarget(wrong, scale_path=False)
     np.testing.assert_allclose(rigid[:, 0], wrong[:, 0], atol=1e-12)
     bones = rigid[:, 1:] - rigid[:, list(sk.PARENTS[1:])]
     np.testing.assert_allclose(np.linalg.norm(bones, axis=-1), np.tile(sk.BONE_LENGTHS[1:], (61, 1)), atol=1e-12)
-    np.testing.assert_allclose(np.concatenate([ft.retarget(one[None], path=False) for one in wrong]), rigid, atol=1e-12)
-    np.testing.assert_allclose(ft.retarget(joints, path=False), joints, atol=1e-9)
+    np.testing.assert_allclose(
+        np.concatenate([ft.retarget(one[None], scale_path=False) for one in wrong]), rigid, atol=1e-12
+    )
+    np.testing.assert_allclose(ft.retarget(joints, scale_path=False), joints, atol=1e-9)
 
 
 def test_canonical_motion_starts_at_the_origin_facing_z():

@@ -453,7 +453,7 @@ def test_a_timeline_becomes_frames_each_with_its_prompt(here, monkeypatch, capsy
     assert [json.loads(line) for line in open("walk.jsonl")] == frames
     assert sorted(path.name for path in here.iterdir()) == ["plan.tsv", "walk.jsonl", "walk.npy"]
     assert cli.main(["stream", "plan.tsv", "--out", "walk.npy", "--rigid", "--force", *FLAGS]) == 0
-    np.testing.assert_allclose(np.load("walk.npy", allow_pickle=False), retarget(expected, path=False), atol=1e-4)
+    np.testing.assert_allclose(np.load("walk.npy", allow_pickle=False), retarget(expected, scale_path=False), atol=1e-4)
 
 
 def test_lines_are_read_no_sooner_than_needed(here, monkeypatch, capsys):

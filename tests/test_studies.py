@@ -87,11 +87,11 @@ def test_a_row_is_measured_once(tmp_path, monkeypatch):
 
     monkeypatch.setitem(studies.ROWS, "vae", rows)
     first = studies.run("vae", tmp_path, tmp_path)
-    assert calls == [0, 1, 2] and [row["score"] for row in first] == [0.0, 0.33333, 0.66667]
+    assert calls == [0, 1, 2] and [row["score"] for row in first] == ["0.0", "0.33333", "0.66667"]
     lines = (tmp_path / "vae.csv").read_text().splitlines()
     (tmp_path / "vae.csv").write_text("\n".join(lines[:-1]) + "\n")  # as if stopped before the last
     again = studies.run("vae", tmp_path, tmp_path)
-    assert calls == [0, 1, 2, 2] and len(again) == 3
+    assert calls == [0, 1, 2, 2] and again == first  # rows of before and of now alike
 
 
 def test_intervals_and_correlations_against_hand_computed_ones():
@@ -132,8 +132,9 @@ def test_drift_is_seen_where_it_is():
     row = drift.judged(take, 2, 1)
     assert row["frames_beyond"] == 1 / len(take.joints) and row["reach_m"] > 2
     assert row["rigid_frames_beyond"] == 0 and row["rigid_reach_m"] < 1.2 and row["rigid_minutes 0-1"] > 0.9
-    take.joints[5, 3] = np.nan
-    assert drift.judged(take, 2, 1)["finite"] == 0
+    take.joints[half // 2 :] = np.nan
+    row = drift.judged(take, 2, 1)
+    assert row["finite"] == 0 and 0.2 < row["minutes 0-1"] < 0.8 and row["rigid_minutes 1-2"] < 0.2
 
 
 def test_a_study_with_seeds_is_told_with_intervals():
@@ -145,7 +146,8 @@ def test_a_study_with_seeds_is_told_with_intervals():
 
 def test_settings_of_one_model_are_compared_seed_by_seed(monkeypatch):
     monkeypatch.setattr(studies, "PAIRS", {"sampling": [("20 1", "20 0")]})
-    rows = [{"K": "20", "L": str(L), "seed": seed, "fid": 100.0 * seed + L} for seed in range(3) for L in range(2)]
+    rows = [{"K": 20, "L": L, "seed": seed, "fid": 100.0 * seed + L} for seed in range(3) for L in range(2)]
+    rows.sort(key=lambda row: (row["L"], row["seed"] * (1 - 2 * row["L"])))  # the seeds of one setting come backwards
     last = studies.summary("sampling", rows).splitlines()[-1]
     assert last.strip().startswith("20 1 minus 20 0") and last.endswith(" 1 ± 0")
 
@@ -182,10 +184,10 @@ def test_a_prompt_that_latents_in_flight_hear_comes_sooner():
 
 
 def test_a_probe_reads_the_words_and_padding_changes_nothing():
-    found = reading.read(0, 150, 256)
-    assert found["ordinary"]["action"] > 0.5 and found["ordinary"]["all"] <= min(
-        found["ordinary"][field] for field in reading.FIELDS
-    )
+    found = reading.read(0, 150, 256)["ordinary"]
+    assert found["action"] > 0.5 and found["all"] > 0.1
+    blind = reading.read(0, 0, 256)["ordinary"]  # a probe that has learnt nothing
+    assert blind["action"] < 0.3 and blind["all"] < 0.1
     torch.manual_seed(0)
     probe = reading.Probe(8, [["a", "b"], ["c", "d", "e"]]).eval()
     words = Words(torch.randn(2, 5, 8), torch.arange(5) < torch.tensor([[5], [3]]))

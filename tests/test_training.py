@@ -177,6 +177,7 @@ def test_who_looks_ahead_learns_without_a_future(attention, latents, fake_data, 
     ((visible, committed, t),) = seen
     hidden = (batch.valid & ~visible).sum(1)
     assert not (visible & ~batch.valid).any() and visible[:, 0].all()
+    assert not (visible[:, 1:] & ~visible[:, :-1]).any()  # what is hidden is the end
     assert (committed is not None) == (attention == "window")
     assert (hidden > 0).any() == (attention != "causal") and (hidden == 0).any()
     assert (t < 1).all()

@@ -229,11 +229,11 @@ def canonicalize(joints: np.ndarray, retarget: bool = False, floor: bool = False
     return turn(joints, np.full(len(joints), -facing_yaw(joints[:1])[0])).astype(dtype)
 
 
-def retarget(joints: np.ndarray, lengths: np.ndarray = BONE_LENGTHS, path: bool = True) -> np.ndarray:
+def retarget(joints: np.ndarray, lengths: np.ndarray = BONE_LENGTHS, scale_path: bool = True) -> np.ndarray:
     """Give joints (T, 22, 3) the bone lengths (22,) in metres; directions stay, and the path scales by leg.
 
-    path=False leaves the pelvis where it is: generated bones, which nothing in the 263 features keeps, get their length
-    back, frame by frame.
+    scale_path=False leaves the pelvis where it is: generated bones, which nothing in the 263 features keeps, get their
+    length back, frame by frame. ValueError: joints of another body, lengths that are none, a bone without a direction.
     """
     joints, dtype = _checked_joints(joints, bodies=(SMPL22,))
     lengths = np.asarray(lengths, dtype=np.float64)
@@ -246,7 +246,7 @@ def retarget(joints: np.ndarray, lengths: np.ndarray = BONE_LENGTHS, path: bool 
         raise ValueError(f"{JOINT_NAMES[joint]} lies on its parent in frame {frame}: the bone has no direction")
     legs = [5, 8]  # the right thigh and shin of frame 0 say how tall the body is
     result = np.empty_like(joints)
-    result[:, 0] = joints[:, 0] * (lengths[legs].sum() / source[0, legs].sum() if path else 1.0)
+    result[:, 0] = joints[:, 0] * (lengths[legs].sum() / source[0, legs].sum() if scale_path else 1.0)
     for level in LEVELS:
         result[:, level] = result[:, _PARENT_INDEX[level]] + normalize(bones[:, level]) * lengths[level, None]
     return result.astype(dtype)

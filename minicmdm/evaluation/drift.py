@@ -63,10 +63,12 @@ def played(minutes: int) -> list[Take]:
 
 def judged(take: Take, minutes: int, block: int) -> dict[str, float]:
     """One stream's numbers: how far joints are, and its accuracy in each `block` minutes, by where a prompt begins."""
-    row = {"finite": float(np.isfinite(take.joints).all())}
-    take = replace(take, joints=np.nan_to_num(take.joints))  # the oracle refuses what is no number
+    finite = np.isfinite(take.joints).all((1, 2))  # (T,)
+    row = {"finite": float(finite.all())}
+    held = np.maximum.accumulate(np.where(finite, np.arange(len(finite)), 0))  # what is no number stands still
+    take = replace(take, joints=take.joints[held])
     begins = np.array([start for start, _ in take.spans])
-    for body, joints in (("", take.joints), ("rigid_", retarget(take.joints, path=False))):
+    for body, joints in (("", take.joints), ("rigid_", retarget(take.joints, scale_path=False))):
         far = np.linalg.norm(joints - joints[:, :1], axis=-1)  # (T,22)
         row[f"{body}reach_m"] = float(far.max())
         row[f"{body}frames_beyond"] = float((far > REACH + BEYOND).any(1).mean())

@@ -2,7 +2,8 @@
 
 The text encoder is frozen before the denoiser is trained. When a model fails to do what new phrases say, either the
 vectors do not tell it or it cannot read them. A probe decides: a small transformer layer learns from the training
-segments' sentences to name each field of the program, and is asked about sentences it has never seen.
+segments' sentences to name each field of the program, and is asked about test segments whose sentence, word for word,
+no training segment has. A field counts where the program states it; "all" are the segments with every field named.
 
 `python -m minicmdm.evaluation.studies reading` runs it, in a minute a seed.
 """
@@ -18,12 +19,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from minicmdm.data.dataset import Clip, toy_dataset
-from minicmdm.data.programs import Segment
+from minicmdm.data.programs import FIELDS, Segment
 from minicmdm.models.text import Words
 from minicmdm.models.wordcache import WordCache
 from minicmdm.pipeline import MotionPipeline
 
-FIELDS = ("action", "count", "side", "direction")
 KINDS = ("ordinary", "paraphrase", "pairs")
 STEPS, BATCH, RATE, WIDTH = 600, 64, 2e-3, 64
 
@@ -52,7 +52,7 @@ def sentences(clips: list[Clip]) -> list[tuple[str, Segment]]:
 
 @cache
 def read(seed: int, steps: int = STEPS, limit: int | None = None) -> dict[str, dict[str, float]]:
-    """Train a probe; for each kind of test clip the share of segments whose field it names, and of all fields.
+    """Train a probe; for each kind of test clip the share of fields that it names, where stated, and "all" of them.
 
     `limit` takes only the first clips of each split.
     """
@@ -79,14 +79,16 @@ def read(seed: int, steps: int = STEPS, limit: int | None = None) -> dict[str, d
         optimizer.step()
         decay.step()
 
-    found = {}
+    found, known = {}, {said for said, _ in train}
     for kind in KINDS:
-        asked = sentences([clip for clip in test if clip.kind == kind])
+        new = [clip for clip in test if clip.kind == kind]
+        asked = [(said, segment) for said, segment in sentences(new) if said not in known]
         with torch.no_grad():
             scores = probe(words.encode([said for said, _ in asked]))
         same = torch.stack([score.argmax(-1) for score in scores], dim=1) == answers(asked)  # (B,fields)
-        found[kind] = {field: same[:, k].float().mean().item() for k, field in enumerate(FIELDS)}
-        found[kind]["all"] = same.all(1).float().mean().item()
+        stated = torch.tensor([[getattr(s, field) is not None for field in FIELDS] for _, s in asked])
+        found[kind] = {field: same[stated[:, k], k].float().mean().item() for k, field in enumerate(FIELDS)}
+        found[kind]["all"] = (same | ~stated).all(1).float().mean().item()
     return found
 
 
