@@ -150,6 +150,8 @@ def test_settings_of_one_model_are_compared_seed_by_seed(monkeypatch):
     rows.sort(key=lambda row: (row["L"], row["seed"] * (1 - 2 * row["L"])))  # the seeds of one setting come backwards
     last = studies.summary("sampling", rows).splitlines()[-1]
     assert last.strip().startswith("20 1 minus 20 0") and last.endswith(" 1 ± 0")
+    assert studies.summary("sampling", rows[:-1]).splitlines()[-1].endswith(" 1 ± 0")  # a study that is under way
+    assert "minus" not in studies.summary("sampling", rows[:3])
 
 
 def test_small_models_of_one_name_are_one_model(tmp_path, monkeypatch):

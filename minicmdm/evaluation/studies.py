@@ -83,8 +83,10 @@ def summary(name: str, rows: list[Row]) -> str:
                 {row["seed"]: row for row in rows if [str(row[k]) for k in labels] == kind.split()}
                 for kind in (one, other)
             )
-            change = (interval([float(first[s][key]) - float(second[s][key]) for s in first]) for key in keys)
-            table.append([f"{one} minus {other}", *[""] * (len(labels) - 1), *change])
+            seeds = [seed for seed in first if seed in second]
+            change = (interval([float(first[s][key]) - float(second[s][key]) for s in seeds]) for key in keys)
+            if seeds:  # a study that is under way may lack either
+                table.append([f"{one} minus {other}", *[""] * (len(labels) - 1), *change])
     else:
         table = [list(rows[0]), *([row[key] for key in rows[0]] for row in rows)]
     widths = [max(len(str(line[k])) for line in table) for k in range(len(table[0]))]
