@@ -127,7 +127,7 @@ class TrainConfig:
     dit_warmup: int = 2_000
     dit_muon: float = 0.0  # Muon's learning rate for the blocks' matrices (ours); 0: AdamW for all, as the release
     levels: str = "random"  # of the latents: independent (CMDM Alg. 1), "staircase", as FSS will present them, or
-    # "triangle", FloodDiffusion's staircase of one height
+    # "triangle", FloodDiffusion's staircase of one height, or "tiled", all triangles of a clip at once (ours)
     overlap: int = 5  # n_s, the latents of that triangle
     time_power: float = 1.0  # random times are u ** time_power: 1 is the paper's, more draws noisy latents more often
     ema: float = 0.9999

@@ -143,7 +143,7 @@ def grid_rows(scratch: Path) -> Rows:
     plan = shipped_vae(preset("micro"))
     whole = plan.train.dit_steps
     cells = [(attention, levels) for attention in ("causal", "bidirectional") for levels in ("random", "triangle")]
-    for position, steps in (("clock", whole), ("clock", whole // 2), ("rotary", whole)):
+    for position, steps in (("clock", whole), ("clock", whole // 2), ("rotary", whole // 2)):
         for seed in SEEDS:
             for attention, levels in cells:
                 dit = replace(plan.dit, attention=attention, clock=position == "clock")

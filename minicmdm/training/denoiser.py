@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from minicmdm.config import Preset
 from minicmdm.data.dataset import MotionDataset
 from minicmdm.diffusion.forcing import diffusion_forcing_loss, draw_boundary, draw_staircase, draw_times
+from minicmdm.diffusion.tiles import draw_tiles, in_tiles
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.text import TextEncoder, Words
 from minicmdm.models.wordcache import WordCache
@@ -95,13 +96,15 @@ def denoising_loss(
     `word_drop` says how often a word is hidden. All is drawn on the CPU, the same for every device, and then goes to
     the denoiser's.
     """
-    block_size, committed, visible = plan.dit.block_size, None, batch.valid
+    block_size, committed, visible, tile = plan.dit.block_size, None, batch.valid, None
     if plan.system in MASKED:  # no levels: what is masked is drawn with the loss
         t = torch.zeros(batch.valid.shape)
     elif plan.train.levels == "staircase":
         t, committed, visible = draw_staircase(batch.valid, block_size, generator)
     elif plan.train.levels == "triangle":
         t, committed, visible = draw_triangle(batch.valid, plan.train.overlap, generator)
+    elif plan.train.levels == "tiled":
+        t, tile = draw_tiles(batch.valid, plan.train.overlap, generator)
     else:
         t = draw_times(*batch.valid.shape, block_size, generator, plan.train.time_power)
         if plan.dit.attention != "causal":  # who looks ahead must have seen motions whose rest still waits, hidden
@@ -117,7 +120,7 @@ def denoising_loss(
         if plan.system in MASKED:
             return masked_loss(dit, batch.z, seen, mask, visible, batch.clock, generator)
         return diffusion_forcing_loss(
-            dit,
+            dit if tile is None else in_tiles(dit, batch.z, tile.to(device)),
             batch.z,
             seen,
             mask,
