@@ -60,9 +60,11 @@ def test_crops_are_pieces_of_clips(fake_data):
     assert 64 in lengths and len(lengths) > 1
 
 
-def test_latents_are_normalised_and_padding_changes_nothing(fake_data, tiny_preset):
+@pytest.mark.parametrize("causal", [True, False])
+def test_latents_are_normalised_and_company_changes_nothing(fake_data, tiny_preset, causal):
+    """A clip's latents are those of the clip alone, for an encoder that looks ahead as well."""
     torch.manual_seed(1)
-    vae = MACVAE(tiny_preset.vae)
+    vae = MACVAE(replace(tiny_preset.vae, causal=causal))
     latents = batches.encode_dataset(vae, fake_data)
     for clip, mean, std in zip(fake_data.clips, latents.means, latents.stds):
         whole = len(clip.features) // 4 * 4

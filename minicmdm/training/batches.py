@@ -122,16 +122,14 @@ def encode_dataset(vae: MACVAE, data: MotionDataset, stats: tuple[Tensor, Tensor
     device = next(vae.parameters()).device
     means: list = [None] * len(data.clips)
     stds: list = [None] * len(data.clips)
-    order = sorted(range(len(data.clips)), key=lambda i: len(data.clips[i].features))
-    for first in range(0, len(order), 64):
-        chosen = order[first : first + 64]
-        counts = [len(data.clips[i].features) // 4 for i in chosen]
-        batch = np.zeros((len(chosen), 4 * max(counts), data.mean.shape[0]), np.float32)
-        for row, i, n in zip(batch, chosen, counts):  # zeros after the end: a causal encoder never looks there
-            row[: 4 * n] = (data.clips[i].features[: 4 * n] - data.mean) / data.std
-        mean, logvar = vae.encode(torch.from_numpy(batch).to(device))  # (B,N,C) each
-        for i, n, m, s in zip(chosen, counts, mean.cpu(), (0.5 * logvar).exp().cpu()):
-            means[i], stds[i] = m[:n].clone(), s[:n].clone()
+    counts = np.array([len(clip.features) // 4 for clip in data.clips])
+    for n in np.unique(counts):  # clips of one length together: an encoder that looks ahead must not see padding
+        same = np.flatnonzero(counts == n)
+        for chosen in np.split(same, range(64, len(same), 64)):
+            batch = np.stack([(data.clips[i].features[: 4 * n] - data.mean) / data.std for i in chosen])
+            mean, logvar = vae.encode(torch.from_numpy(batch.astype(np.float32)).to(device))  # (B,N,C) each
+            for i, m, s in zip(chosen, mean.cpu(), (0.5 * logvar).exp().cpu()):
+                means[i], stds[i] = m.clone(), s.clone()
     if stats is None:
         every_mean, every_std = torch.cat(means), torch.cat(stds)  # (all latents, C)
         variance = every_mean.var(0) + every_std.square().mean(0)
