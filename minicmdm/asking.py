@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -48,6 +50,14 @@ def usual_sampling(
     given = (schedule, num_steps, uncertainty)
     names = ("schedule", "num_steps", "uncertainty")
     return {name: own if value is None else value for name, value, own in zip(names, given, usual)}
+
+
+def batches(lengths: list[int], most: int, alike: bool) -> Iterator[list[int]]:
+    """The places of lengths that are sampled together, at most `most`: near each other or, with `alike`, the same."""
+    order = sorted(range(len(lengths)), key=lengths.__getitem__)
+    for _, group in groupby(order, lengths.__getitem__ if alike else lambda _: None):
+        together = list(group)
+        yield from (together[first : first + most] for first in range(0, len(together), most))
 
 
 def sampling_of(

@@ -119,10 +119,9 @@ class MotionPipeline:
         seeds = [asking.integer(s, "seed", 0, 2**63 - 1) for s in asking.spread(seed, len(prompts), "seed")]
         ask = self._asked(schedule, num_steps, uncertainty, block_size, guidance_scale, solver, tell_length)
         motions: dict[int, Motion] = {}
-        order = sorted(range(len(prompts)), key=lambda i: frames[i])
-        for first in range(0, len(order), TOGETHER):
-            chosen = order[first : first + TOGETHER]
-            counts = [-(-frames[i] // 4) for i in chosen]  # latents: frames / 4, rounded up
+        lengths = [-(-n // 4) for n in frames]  # latents: frames / 4, rounded up
+        for chosen in asking.batches(lengths, TOGETHER, alike=self.preset.dit.attention == "window"):
+            counts = [lengths[i] for i in chosen]
             luck = [torch.Generator().manual_seed(seeds[i]) for i in chosen]
             latents = self._latents([prompts[i] for i in chosen], counts, luck, ask)
             for i, count, one in zip(chosen, counts, latents):  # a VAE that looks ahead must not see padding
@@ -149,10 +148,10 @@ class MotionPipeline:
         """Sampled latents (B,N,C), N the greatest of `counts`, of which the first (B,P,C) may be given."""
         plan = dict(schedule=ask.schedule, num_steps=ask.num_steps, uncertainty=ask.uncertainty)
         plain = ask.solver == "euler" and ask.schedule != "trapezoid" and prefix is None
-        if plain and self.preset.dit.attention == "causal" and self.preset.dit.target == "v":
+        # A stream knows no padding. Causal latents do not look at it, and under "window" there is none (`batches`).
+        if plain and self.preset.dit.attention != "bidirectional" and self.preset.dit.target == "v":
             how = dict(block_size=ask.block_size, guidance_scale=ask.guidance_scale)
             how |= dict(num_latents=max(counts), lasts=counts if ask.tell_length else 0)
-            # The same numbers for less work. It knows no padding, but causal latents do not see what comes later.
             return LatentStream(self.dit, self._read, self._read([""]), prompts, luck, **plan, **how).drain()
         given = 0 if prefix is None else prefix.shape[1]
         noise = torch.stack([self._noise(generator, max(counts)) for generator in luck])[:, given:]  # (B,N-P,C)
