@@ -21,7 +21,7 @@ MIN_FRAMES, MAX_FRAMES = 4, 196  # one latent, and the longest motion of HumanML
 MAX_STEPS = 1000
 MAX_GUIDANCE = 100.0
 # How each system samples unless told: schedule, K and L. FloodDiffusion's triangle has n_s = K / L = 5 latents.
-USUAL_SAMPLING = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2)}
+USUAL_SAMPLING = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2), "window": ("triangular", 10, 2)}
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ def _parser() -> Parser:
 
     sub = command("train", train, "Train a preset from nothing: judges, teacher, VAE, denoiser.")
     sub.add_argument("--preset", default="toy", help="toy, micro, S, M, L or XL (default toy)")
-    sub.add_argument("--system", default="cmdm", help="cmdm, flood, mardm or cdamd (default cmdm)")
+    sub.add_argument("--system", default="cmdm", help="cmdm, flood, mardm, cdamd or window (default cmdm)")
     sub.add_argument("--out", required=True, help="checkpoint folder to make")
     sub.add_argument("--stage", default="all", help="evaluator, tmr, vae, dit or all (default all)")
     sub.add_argument("--resume", action="store_true", help="go on with the run in --out")

@@ -1,4 +1,4 @@
-"""The four systems through the same doors: trained, loaded, asked, edited, and each refuses what it cannot do."""
+"""The systems through the same doors: trained, loaded, asked, edited, and each refuses what it cannot do."""
 
 from dataclasses import fields, replace
 
@@ -97,7 +97,7 @@ def test_editing_keeps_what_is_given(pipe):
         pipe.edit(Motion(joints[:15], caption="a person walks"))
 
 
-def test_only_two_of_them_stream(pipe):
+def test_those_with_levels_stream(pipe):
     if pipe.preset.system in MASKED:
         with pytest.raises(ValueError, match="cannot stream"):
             pipe.stream("a person walks")
@@ -111,7 +111,8 @@ def test_only_two_of_them_stream(pipe):
 
 
 def test_each_samples_in_its_own_way_unless_told(pipe):
-    usual = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2)}.get(pipe.preset.system, ("full", 10, 0))
+    flood = ("triangular", 10, 2)
+    usual = {"cmdm": ("fss", 20, 2), "flood": flood, "window": flood}.get(pipe.preset.system, ("full", 10, 0))
     assert tuple(pipe.sampling(None, None, None).values()) == usual
     if pipe.preset.system not in MASKED:
         assert tuple(pipe.sampling("autoregressive", 7, None).values()) == ("autoregressive", 7, 2)

@@ -31,8 +31,8 @@ from minicmdm.evaluation.protocols import _answers, _entry, text_to_motion
 from minicmdm.pipeline import SHIPPED, MotionPipeline
 from minicmdm.systems import MASKED
 
-# On the first 128 validation prompts (`python -m minicmdm.evaluation.studies guidance`).
-GUIDANCE = {"cmdm": 3.0, "flood": 2.0, "mardm": 3.0, "cdamd": 2.0}
+# On the first 128 validation prompts (`python -m minicmdm.evaluation.studies guidance`); window, not shipped: flood's.
+GUIDANCE = {"cmdm": 3.0, "flood": 2.0, "mardm": 3.0, "cdamd": 2.0, "window": 2.0}
 LATENTS = 30
 SEAMS = 128  # test clips whose seams are looked at
 COLUMNS = (

@@ -1,9 +1,10 @@
-"""The four systems. They share data, words, VAE layers, transformer, path, sampler and judges; see config.preset.
+"""The systems. They share data, words, VAE layers, transformer, path, sampler and judges; see config.preset.
 
 cmdm     causal attention, independent noise levels, FSS                     (the rest of this library)
 flood    FloodDiffusion: bidirectional attention, triangles of levels        flood.py
 mardm    masked latents and a diffusion head, on essential features          mardm.py
 cdamd    the same on coordinates, with a dual-constrained mask               cdamd.py
+window   ours: flood, but that finished latents look back, and all windows of a clip learn at once  diffusion/tiles.py
 """
 
 from __future__ import annotations
