@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # slow to import
 MIN_FRAMES, MAX_FRAMES = 4, 196  # one latent, and the longest motion of HumanML3D (9.8 s)
 MAX_STEPS = 1000
 MAX_GUIDANCE = 100.0
-# How each system samples unless told: schedule, K and L. FloodDiffusion's triangle has n_s = K / L = 5 latents.
+# How each system samples unless told: schedule, K and L. The triangle of flood and window has n_s = K / L = 5.
 USUAL_SAMPLING = {"cmdm": ("fss", 20, 2), "flood": ("triangular", 10, 2), "window": ("triangular", 10, 2)}
 
 
@@ -42,7 +42,7 @@ def usual_sampling(
 ) -> dict[str, str | int]:
     """A system's own schedule, K and L, but for what is given. Another schedule comes with K = 20 and L = 2.
 
-    FloodDiffusion has learnt triangles of n_s latents, so with another K its L is K / n_s.
+    Flood and window have learnt triangles of n_s latents, so with another K its L is K / n_s.
     """
     usual = USUAL_SAMPLING[system if schedule is None else "cmdm"]
     if usual[0] == "triangular" and uncertainty is None and isinstance(num_steps, int):

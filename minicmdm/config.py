@@ -279,12 +279,12 @@ def preset(name: str, system: str = "cmdm") -> Preset:
 
 
 def as_system(plan: Preset, system: str) -> Preset:
-    """A plan of CMDM's as another system has it: words, clock, minutes and about the number of weights stay."""
+    """A plan of CMDM's as another system has it: words, clock, about the minutes and the number of weights stay."""
     plan = replace(plan, system=system)
     if system == "cmdm":
         return plan
     plan = replace(plan, dit=replace(plan.dit, attention="window" if system == "window" else "bidirectional"))
-    if system == "window":  # a step sees each clip twice and takes longer: the same minutes
+    if system == "window":  # a step sees each clip twice: half the steps, and a tenth more
         return replace(plan, train=replace(plan.train, levels="tiled", dit_steps=plan.train.dit_steps * 36 // 65))
     if system == "flood":
         return replace(plan, train=replace(plan.train, levels="triangle"))

@@ -148,7 +148,7 @@ class MotionPipeline:
         """Sampled latents (B,N,C), N the greatest of `counts`, of which the first (B,P,C) may be given."""
         plan = dict(schedule=ask.schedule, num_steps=ask.num_steps, uncertainty=ask.uncertainty)
         plain = ask.solver == "euler" and ask.schedule != "trapezoid" and prefix is None
-        # A stream knows no padding. Causal latents do not look at it, and under "window" there is none (`batches`).
+        # A stream knows no padding. Causal latents do not look at it, and under "window" there is none (asking.py).
         if plain and self.preset.dit.attention != "bidirectional" and self.preset.dit.target == "v":
             how = dict(block_size=ask.block_size, guidance_scale=ask.guidance_scale)
             how |= dict(num_latents=max(counts), lasts=counts if ask.tell_length else 0)

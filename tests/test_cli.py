@@ -129,7 +129,7 @@ BAD = {
     "train data": (["train", "--out", "run", "--data", "full"], "train.txt"),
     "train seed": (["train", "--out", "run", "--seed", "-3"], "--seed"),
     "train threads": (["train", "--out", "run", "--threads", "0"], "--threads"),
-    "train system": (["train", "--out", "run", "--system", "mdm"], "cmdm, flood, mardm, cdamd"),
+    "train system": (["train", "--out", "run", "--system", "mdm"], "cmdm, flood, mardm, cdamd, window"),
     "compare its own way": (["evaluate", "--compare", "--steps", "5"], "leave out --steps"),
     "compare guidance": (["evaluate", "--compare", "--guidance", "2"], "leave out --guidance"),
     "evaluate limit": (["evaluate", "--quick", "--limit", "0"], "--limit"),

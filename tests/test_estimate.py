@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from minicmdm.cli import main
-from minicmdm.config import preset
+from minicmdm.config import as_system, preset
 from minicmdm.models.dit import CausalDiT
 from minicmdm.models.vae import MACVAE
 from minicmdm.training.estimate import estimate
@@ -30,6 +30,8 @@ def test_arithmetic_and_memory_grow_as_they_must():
     assert 1.9 < twice["dit"].flops / one["dit"].flops < 2.0  # all but the modulation of the levels
     kept = [x["dit"].memory - 20 * x["dit"].parameters for x in (one, twice)]
     assert 1.9 < kept[1] / kept[0] < 2.0
+    doubled = by_stage(as_system(plan, "window"))["dit"].flops / by_stage(as_system(plan, "flood"))["dit"].flops
+    assert 1.9 < doubled < 2.2  # a clip and its clean copy
     three = by_stage(plan, accumulate=3)  # in turn: three times the work in the same memory
     assert three["vae"].flops == 3 * one["vae"].flops and three["vae"].memory == one["vae"].memory
 

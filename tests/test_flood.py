@@ -363,11 +363,13 @@ def test_the_last_stage_trains_on_triangles_of_its_plan():
         assert torch.equal(spy.valid, shown)
 
 
-def test_floods_preset_samples_the_triangle_that_it_trains():
+@pytest.mark.parametrize("system", ["flood", "window"])
+def test_presets_sample_the_triangle_that_they_train(system):
     for name in ("toy", "M"):
-        plan = preset(name, "flood")
-        assert (plan.dit.attention, plan.train.levels, plan.dit.target) == ("bidirectional", "triangle", "v")
-        how = usual_sampling("flood", None, None, None)
+        plan = preset(name, system)
+        kind = {"flood": ("bidirectional", "triangle"), "window": ("window", "tiled")}[system]
+        assert (plan.dit.attention, plan.train.levels) == kind and plan.dit.target == "v"
+        how = usual_sampling(system, None, None, None)
         assert how["schedule"] == "triangular" and -(-how["num_steps"] // how["uncertainty"]) == plan.train.overlap
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import minicmdm
-from minicmdm import Motion, MotionPipeline
+from minicmdm import Motion, MotionPipeline, asking
 from minicmdm.motion import load_joints
 from minicmdm.pipeline import ASSETS
 from minicmdm.training import checkpoints
@@ -243,3 +243,10 @@ def test_solvers_differ_and_unknown_ones_are_refused(pipe):
     assert np.array_equal(ddpm.features, again.features)  # its new noise comes from the seed, too
     with pytest.raises(ValueError, match="unknown solver 'leapfrog'"):
         pipe("a person walks", solver="leapfrog")
+
+
+def test_batches_are_near_in_length_or_alike():
+    lengths = [5, 3, 5, 3, 5, 9]
+    assert list(asking.batches(lengths, 4, alike=False)) == [[1, 3, 0, 2], [4, 5]]
+    assert list(asking.batches(lengths, 2, alike=True)) == [[1, 3], [0, 2], [4], [5]]
+    assert list(asking.batches([], 2, alike=True)) == []

@@ -175,7 +175,7 @@ def test_small_models_of_one_name_are_one_model(tmp_path, monkeypatch):
         assert len(set(labels)) == len(labels) and len(labels) % 3 == 0  # three seeds of each
     plans = [plan for (_, seed), (plan, _) in made.items() if seed == 0]
     # flow, sampling and a cell of the grid are causal-random again
-    assert len(plans) == 3 + 4 + 1 + 12 and all(a != b for a, b in combinations(plans, 2))
+    assert len(plans) == 3 + 4 + 1 + 13 and all(a != b for a, b in combinations(plans, 2))
     assert {ask.get("solver") for ask in asked} == {None, "euler", "ddpm", "ddim"}
 
 

@@ -5,12 +5,12 @@ asks for the window, 4.4 of the 31 latents of a mean toy clip; the rest of the w
 the sequence twice. The first copy is clean and looks back. The second is cut into windows, each of which holds the
 triangle of one moment, sees the clean latents before it and itself, and nothing else:
 
-                 clean 0 1 2 3 4 5   noisy 0 1 | 2 3 4 | 5        n_s = 3, the tiles begin one latent late
+                 clean 0 1 2 3 4 5   noisy 0 1 | 2 3 4 | 5        n_s = 3, the first begins one latent before the clip
     clean  i     itself and what is before                         no window is looked at
     noisy  i     what is clean before its window      its window
 
-So a latent in flight sees what it sees under the "window" mask (models/dit.py), for each moment that differs by a whole
-window, at twice the price of one of them. Block diffusion trains so (Arriola et al. 2025, Sec. 4), with one level a
+So a latent in flight sees what it sees under the "window" mask (models/dit.py), for all moments of the clip that lie a
+whole window apart, at twice the price of one of them. Block diffusion trains so (Arriola et al. 2025), with one level a
 block. It needs a past that does not look ahead: under FloodDiffusion's bidirectional mask finished latents see the
 window, and no copy of them could serve two windows.
 """
@@ -40,26 +40,25 @@ def draw_tiles(valid: Tensor, overlap: int, generator: torch.Generator | None = 
     return since.to(torch.float32) / (TICKS * overlap), place // overlap
 
 
-def tiled_mask(tile: Tensor, valid: Tensor, attention: str) -> Tensor:
-    """Who sees whom among the 2N latents: tile (B,N), valid (B,N) -> (B,2N,2N) bool. ValueError: "bidirectional".
-
-    attention "window": all of a window see each other. "causal": they look back.
-    """
-    if attention == "bidirectional":
-        raise ValueError('tiles need finished latents that do not look ahead: take attention "window" or "causal"')
+def tiled_mask(tile: Tensor, valid: Tensor) -> Tensor:
+    """Who sees whom among the 2N latents, clean ones first: tile (B,N), valid (B,N) -> (B,2N,2N) bool."""
     place = torch.arange(tile.shape[1], device=tile.device)
     back = (place[:, None] >= place).expand(len(tile), -1, -1)  # (B,N,N)
     same, before = tile.unsqueeze(2) == tile.unsqueeze(1), tile.unsqueeze(2) > tile.unsqueeze(1)
-    inside = same & back if attention == "causal" else same
-    clean, noisy = torch.cat([back, torch.zeros_like(back)], 2), torch.cat([before, inside], 2)  # (B,N,2N) each
+    clean, noisy = torch.cat([back, torch.zeros_like(back)], 2), torch.cat([before, same], 2)  # (B,N,2N) each
     return torch.cat([clean, noisy], 1) & torch.cat([valid, valid], 1)[:, None]
 
 
 def in_tiles(dit: CausalDiT, z: Tensor, tile: Tensor) -> Callable[..., Tensor]:
     """A model for `diffusion_forcing_loss`: what `dit` predicts of noisy latents (B,N,C), each in its window.
 
-    z (B,N,C) are the clean ones, tile (B,N) comes from `draw_tiles`.
+    z (B,N,C) are the clean ones, tile (B,N) comes from `draw_tiles`. ValueError: another attention than "window".
     """
+    if dit.cfg.attention != "window":
+        raise ValueError(
+            f'tiles teach latents in flight after a past that looks back: attention must be "window", '
+            f"and this model's is {dit.cfg.attention!r}"
+        )
 
     def model(
         noisy: Tensor, t: Tensor, words: Tensor, word_mask: Tensor, valid: Tensor, clock: Tensor | None
@@ -73,7 +72,7 @@ def in_tiles(dit: CausalDiT, z: Tensor, tile: Tensor) -> Callable[..., Tensor]:
             dit.modulations(levels),
             dit.keys_values(words),
             word_mask.repeat(1, 2, 1),
-            tiled_mask(tile, valid, dit.cfg.attention),
+            tiled_mask(tile, valid),
             torch.arange(z.shape[1], device=z.device).repeat(2),
             told,
         )[:, z.shape[1] :]  # (B,2N,C) -> (B,N,C)

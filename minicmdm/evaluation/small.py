@@ -139,14 +139,15 @@ def grid_rows(scratch: Path) -> Rows:
     CMDM reports that causal x random works (FID 0.068), FloodDiffusion that bidirectional x triangle does (0.057) and
     that the other two cells do not (3.377 and 3.883). Rotary positions know distances only; "clock" tells a latent
     where it is as well. A triangle teaches few latents of a clip: at the shorter length the window mask is there too,
-    with all of a clip's triangles at once (tiles.py).
+    with one triangle a clip and with all of them at once (tiles.py: as many steps, each twice the work).
     """
     plan = shipped_vae(preset("micro"))
     whole = plan.train.dit_steps
     cells = [(attention, levels) for attention in ("causal", "bidirectional") for levels in ("random", "triangle")]
+    more = [("window", "tiled"), ("window", "triangle")]
     for position, steps in (("clock", whole), ("clock", whole // 2), ("rotary", whole // 2)):
         for seed in SEEDS:
-            for attention, levels in cells + [("window", "tiled")] * (position == "clock" and steps < whole):
+            for attention, levels in cells + more * (position == "clock" and steps < whole):
                 dit = replace(plan.dit, attention=attention, clock=position == "clock")
                 own = replace(plan, dit=dit, train=replace(plan.train, levels=levels, dit_steps=steps))
                 name = f"{attention}-{levels}" + "-rotary" * (position == "rotary") + "-half" * (steps < whole)

@@ -26,7 +26,7 @@ class MaskedPipeline(MotionPipeline):
 
     def stream(self, *_, **__) -> MotionStream:
         """There is none. ValueError."""
-        raise ValueError(f"{self.preset.system} makes all of a motion together and cannot stream: take cmdm or flood")
+        raise ValueError(f"{self.preset.system} makes all of a motion together: to stream, take cmdm, flood or window")
 
     @torch.no_grad()
     def _latents(self, prompts, counts, luck, ask: Asked, given: Tensor | None = None, keep: Tensor | None = None):

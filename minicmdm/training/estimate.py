@@ -48,7 +48,7 @@ class Estimate:
 def estimate(plan: Preset, accumulate: int = 1) -> list[Estimate]:
     """What the stages tmr (its motion side), vae and dit of a preset need, with `accumulate` batches a step in turn."""
     cfg, group = plan.train, plan.vae.frames_per_latent
-    latents = MAX_FRAMES // group
+    latents = MAX_FRAMES // group * (2 if cfg.levels == "tiled" else 1)  # tiles.py: a clean copy of each beside it
 
     with FakeTensorMode():
         words_side = SimpleNamespace(cfg=plan.text)  # is not run
