@@ -10,7 +10,8 @@ the past is clean, the future hidden, and the loss asks for the latents in fligh
 velocity in the window depends on all of the window (Theorem 3.8), and a causal mask would have to guess (gaussian.py).
 Each latent sees the words of the prompt that is active at its time, as everywhere in this library.
 
-Triangle and FSS are one schedule: N = K steps a latent and n_s = K / L (schedules.py).
+Triangle and FSS are one schedule: N = K steps a latent and n_s = K / L (schedules.py). The system "window" (ours) lets
+finished latents look back only, and learns from all triangles of a clip at once (diffusion/tiles.py).
 
 Where the paper misprints or its code errs, this file does the right thing and tests/test_errata_flows.py shows both:
 
