@@ -22,7 +22,7 @@ from torch import Tensor
 
 from minicmdm.models.dit import CausalDiT, clock_features
 
-TICKS = 12  # moments between two latents' starts at which training looks
+TICKS = 12  # moments between two latents' starts at which training looks, here and in systems/flood.py
 
 
 def draw_tiles(valid: Tensor, overlap: int, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:

@@ -28,9 +28,9 @@ import torch
 from torch import Tensor
 
 from minicmdm.diffusion.path import data_to_velocity, noise_to_velocity
+from minicmdm.diffusion.tiles import TICKS
 from minicmdm.models.dit import TARGETS
 
-TICKS = 12  # moments between two latents' starts at which training looks
 NEAR_NOISE = 0.02  # of t: below it predicted noise says nothing of the data
 
 
